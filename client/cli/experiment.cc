@@ -1,0 +1,266 @@
+#include "client/cli/experiment.h"
+
+#include <google/protobuf/io/coded_stream.h>
+#include <google/protobuf/io/zero_copy_stream_impl_lite.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <filesystem>
+#include <fstream>
+#include <iostream>
+#include <map>
+
+#include <absl/strings/str_cat.h>
+#include <absl/strings/str_format.h>
+#include <nlohmann/json.hpp>
+
+#include "client/cli/exit_codes.h"
+#include "client/cli/experiment_report.h"
+#include "client/cli/flags.h"
+#include "server/control/interrupts.h"
+#include "server/control/local_allocator.h"
+#include "server/control/run.h"
+#include "server/control/world_file.h"
+
+namespace aureole {
+namespace {
+
+using Clock = std::chrono::steady_clock;
+
+constexpr Tick kHashEvery = 100;
+
+// Where a run is, on stderr: one line in place on a terminal, else a line every five seconds.
+class Progress {
+ public:
+  Progress(std::string name, Tick last_tick, int64_t tick_us)
+      : name_(std::move(name)), last_tick_(last_tick), tick_s_(static_cast<double>(tick_us) * 1e-6) {}
+  ~Progress() {
+    if (terminal_ && shown_) std::cerr << "\r\x1b[K" << std::flush;
+  }
+
+  void Show(const RunStatus& status) {
+    const auto now = Clock::now();
+    if (now < next_) return;
+    next_ = now + (terminal_ ? std::chrono::milliseconds(500) : std::chrono::milliseconds(5000));
+    shown_ = true;
+    const Tick tick = status.MinTick();
+    std::string line = absl::StrFormat("%s: %.1f of %.1f s, %d bodies", name_, static_cast<double>(tick) * tick_s_,
+                                       static_cast<double>(last_tick_) * tick_s_, status.Bodies());
+    for (const std::string& w : status.Waiting()) absl::StrAppend(&line, "; ", w);
+    if (terminal_) {
+      std::cerr << "\r" << line.substr(0, 150) << "\x1b[K" << std::flush;
+    } else {
+      std::cerr << line << '\n';
+    }
+  }
+
+ private:
+  const std::string name_;
+  const Tick last_tick_;
+  const double tick_s_;
+  const bool terminal_ = isatty(STDERR_FILENO) != 0;
+  bool shown_ = false;
+  Clock::time_point next_{};
+};
+
+class Experimenter {
+ public:
+  explicit Experimenter(const ExperimentOptions& options) : options_(options) {
+    experiment_.duration_s = options.duration_s;
+    experiment_.repeat = options.repeat;
+    experiment_.real_time = !options.no_real_time;
+    experiment_.hash_every = kHashEvery;
+  }
+
+  // Appends the row of one world, running its undivided reference first when nobody has.
+  absl::Status Add(const WorldFile& file) {
+    const int64_t tick_us = file.world.environment.tick_us;
+    const Tick last_tick = TicksIn(options_.duration_s, tick_us);
+    const std::string key = ContentKey(file.spec);
+    if (!references_.contains(key)) {
+      const absl::StatusOr<std::vector<RunMeasure>> runs = Repeat(file, true, last_tick);
+      if (!runs.ok()) return runs.status();
+      references_[key] = experiment_.references.size();
+      experiment_.references.push_back({file.world.name, MeanOf(*runs)});
+    }
+    Row row;
+    row.world = file.world.name;
+    row.file = file.path;
+    row.figure = FigureOf(file.spec);
+    row.regions = file.world.layout.size();
+    row.exchange_delay = file.world.exchange.k;
+    row.reference = references_[key];
+    row.is_reference = row.regions == 1;
+    const RunMeasure& reference = experiment_.references[row.reference].measure;
+    if (row.is_reference) {
+      row.measure = reference;
+      row.comparison = Compare(row.measure, reference, last_tick);
+    } else {
+      const absl::StatusOr<std::vector<RunMeasure>> runs = Repeat(file, false, last_tick);
+      if (!runs.ok()) return runs.status();
+      row.measure = MeanOf(*runs);
+      row.comparison = CompareAll(*runs, reference, last_tick);
+    }
+    experiment_.rows.push_back(std::move(row));
+    return absl::OkStatus();
+  }
+
+  const Experiment& experiment() const { return experiment_; }
+
+ private:
+  static Figure FigureOf(const v1::WorldSpec& spec) {
+    return spec.layout().has_columns() ? Figure::kColumns : Figure::kCorners;
+  }
+
+  // The first repeat that differs speaks for all.
+  static Comparison CompareAll(const std::vector<RunMeasure>& runs, const RunMeasure& reference, Tick last_tick) {
+    Comparison worst = Compare(runs.front(), reference, last_tick);
+    for (const RunMeasure& run : runs) {
+      const Comparison c = Compare(run, reference, last_tick);
+      if (worst.hash_equal && !c.hash_equal) worst = c;
+      worst.lost = std::max(worst.lost, c.lost);
+      worst.doubled = std::max(worst.doubled, c.doubled);
+    }
+    return worst;
+  }
+
+  absl::StatusOr<std::vector<RunMeasure>> Repeat(const WorldFile& file, bool undivided, Tick last_tick) {
+    std::vector<RunMeasure> out;
+    for (int i = 0; i < options_.repeat; ++i) {
+      std::string name = absl::StrCat(file.world.name, undivided ? ", undivided" : "");
+      if (options_.repeat > 1) absl::StrAppendFormat(&name, ", %d of %d", i + 1, options_.repeat);
+      RunOptions run;
+      run.world = file.spec;
+      run.regions = file.world.layout.size();
+      run.undivided = undivided;
+      run.no_real_time = options_.no_real_time;
+      run.last_tick = last_tick;
+      run.hash_every = kHashEvery;
+      LocalAllocator allocator({options_.region_server, "", false});
+      RunResult result;
+      Progress progress(name, last_tick, file.world.environment.tick_us);
+      const absl::Status s = RunWorld(
+          run, allocator,
+          [&progress](const RunStatus& status) {
+            progress.Show(status);
+            return Interrupts() == 0;
+          },
+          &result);
+      if (!s.ok()) return absl::Status(s.code(), absl::StrCat(name, ": ", s.message()));
+      out.push_back(Measure(result, file.world.environment.tick_us));
+    }
+    return out;
+  }
+
+  const ExperimentOptions& options_;
+  Experiment experiment_;
+  std::map<std::string, size_t> references_;  // by content
+};
+
+absl::Status Write(const std::filesystem::path& path, const std::string& text) {
+  std::ofstream out(path, std::ios::binary | std::ios::trunc);
+  out << text;
+  out.close();
+  return out ? absl::OkStatus() : absl::InternalError(absl::StrCat("cannot write ", path.string()));
+}
+
+absl::Status WriteAll(const Experiment& experiment, const std::filesystem::path& directory) {
+  absl::Status s = Write(directory / "experiment.json", ToJson(experiment).dump(2) + "\n");
+  s.Update(Write(directory / "experiment.csv", ToCsv(experiment)));
+  const std::string columns = ToSvg(experiment, Figure::kColumns), corners = ToSvg(experiment, Figure::kCorners);
+  if (!columns.empty()) s.Update(Write(directory / "columns.svg", columns));
+  if (!corners.empty()) s.Update(Write(directory / "corners.svg", corners));
+  return s;
+}
+
+}  // namespace
+
+std::string ContentKey(const v1::WorldSpec& spec) {
+  v1::WorldSpec content = spec;
+  content.clear_name();
+  content.clear_description();
+  content.clear_layout();
+  content.clear_exchange();
+  std::string bytes;
+  google::protobuf::io::StringOutputStream stream(&bytes);
+  google::protobuf::io::CodedOutputStream coded(&stream);
+  coded.SetSerializationDeterministic(true);
+  content.SerializeToCodedStream(&coded);
+  coded.Trim();
+  return bytes;
+}
+
+CLI::App* AddExperiment(CLI::App& app, ExperimentOptions* o) {
+  CLI::App* e = app.add_subcommand("experiment", "Measure worlds split over servers, each beside the undivided world");
+  e->add_option("worlds", o->worlds, "World files (JSON)")->required()->type_name("FILE");
+  e->add_option("--seed", o->seed, "Instead of the worlds' own seeds");
+  AddDuration(e, &o->duration_s, "Simulated time of each run; 60s when not given");
+  e->add_option("--repeat", o->repeat, "Runs of each world; frame times are their means")
+      ->capture_default_str()
+      ->check(CLI::Range(1, 1000));
+  e->add_flag("--no-real-time", o->no_real_time, "As fast as it can, not at the world's tick");
+  e->add_option("--out", o->out, "Directory for experiment.csv, experiment.json, columns.svg and corners.svg")
+      ->capture_default_str()
+      ->type_name("DIR");
+  e->add_flag("--json", o->json, "Print the JSON instead of the table");
+  e->add_option("--region-server", o->region_server, "Program to start; aureole-region beside this one when not given")
+      ->type_name("FILE");
+  e->footer(
+      std::string("Examples:\n"
+                  "  aureole experiment tests/worlds/paper/column-*.json --out columns\n"
+                  "  aureole experiment tests/worlds/paper/corner-{1,4,9}.json --no-real-time --duration 20s\n\n"
+                  "Every world runs on real processes, one server per region, and once undivided; worlds that differ\n"
+                  "only in layout share that run, and a world of one region is it. The figures follow the paper's\n"
+                  "Figs. 5 and 7: the maximum frame time of any server in each 5 s of simulated time.\n\n") +
+      kExitCodesHelp);
+  return e;
+}
+
+int RunExperiment(const ExperimentOptions& options) {
+  std::vector<WorldFile> files;
+  for (const std::string& path : options.worlds) {
+    absl::StatusOr<WorldFile> file = OpenWorldFile(path, options.seed);
+    if (!file.ok()) {
+      std::cerr << file.status().message() << '\n';
+      return kExitBadInput;
+    }
+    files.push_back(*std::move(file));
+  }
+  std::error_code error;
+  std::filesystem::create_directories(options.out, error);
+  if (error || access(options.out.c_str(), W_OK) != 0) {
+    std::cerr << "--out: cannot write to " << options.out << (error ? ": " + error.message() : "") << '\n';
+    return kExitBadInput;
+  }
+
+  Experimenter experimenter(options);
+  absl::Status status;
+  for (size_t i = 0; i < files.size() && status.ok(); ++i) {
+    std::cerr << absl::StrFormat("[%d/%d] %s, %d regions\n", i + 1, files.size(), files[i].path,
+                                 files[i].world.layout.size());
+    status = experimenter.Add(files[i]);
+  }
+  const Experiment& experiment = experimenter.experiment();
+  // What is done is worth keeping, whatever ended the rest.
+  const absl::Status written = experiment.rows.empty() ? absl::OkStatus() : WriteAll(experiment, options.out);
+  if (options.json) {
+    std::cout << ToJson(experiment).dump(2) << std::endl;
+  } else if (!experiment.rows.empty()) {
+    std::cout << TableText(experiment) << "Written to " << options.out << std::endl;
+  }
+  if (absl::IsCancelled(status)) {
+    std::cerr << "aureole: interrupted\n";
+    return kExitInterrupted;
+  }
+  for (const absl::Status& s : {status, written}) {
+    if (s.ok()) continue;
+    std::cerr << "aureole: " << s.message() << '\n';
+    return kExitFailed;
+  }
+  const bool exact =
+      std::all_of(experiment.rows.begin(), experiment.rows.end(), [](const Row& r) { return r.Exact(); });
+  if (!exact) std::cerr << "aureole: not every split run was exact\n";
+  return exact ? kExitOk : kExitFailed;
+}
+
+}  // namespace aureole

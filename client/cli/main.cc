@@ -1,0 +1,37 @@
+// aureole: the command line of Aureole.
+#include <CLI/CLI.hpp>
+#include <string>
+
+#include "client/cli/check.h"
+#include "client/cli/exit_codes.h"
+#include "client/cli/experiment.h"
+#include "client/cli/up.h"
+#include "server/control/interrupts.h"
+
+int main(int argc, char** argv) {
+  aureole::CatchInterrupts();
+  CLI::App app{"Aureole: one rigid-body world on many servers, with the answer of one."};
+  app.name("aureole");
+  app.require_subcommand(1);
+  app.footer(std::string("Examples:\n"
+                         "  aureole up tests/worlds/demo.json\n"
+                         "  aureole experiment tests/worlds/paper/column-*.json\n"
+                         "  aureole check tests/worlds/*.json\n"
+                         "  aureole up --help\n\n") +
+             aureole::kExitCodesHelp);
+
+  aureole::UpOptions up_options;
+  aureole::ExperimentOptions experiment_options;
+  aureole::CheckOptions check_options;
+  const CLI::App* up = aureole::AddUp(app, &up_options);
+  const CLI::App* experiment = aureole::AddExperiment(app, &experiment_options);
+  aureole::AddCheck(app, &check_options);
+  try {
+    app.parse(argc, argv);
+  } catch (const CLI::ParseError& e) {
+    return app.exit(e) == 0 ? aureole::kExitOk : aureole::kExitBadInput;
+  }
+  if (up->parsed()) return aureole::Up(up_options);
+  if (experiment->parsed()) return aureole::RunExperiment(experiment_options);
+  return aureole::Check(check_options);
+}

@@ -1,0 +1,148 @@
+#include "client/cli/measure.h"
+
+#include <algorithm>
+#include <map>
+
+namespace aureole {
+namespace {
+
+constexpr double kWindowSeconds = 5;  // the paper's
+
+// Sums over servers a window at a time; `ticks` is that of the server that stepped most in it.
+struct WindowSum {
+  WindowMeasure measure;
+  int64_t ticks = 0;
+};
+
+void Add(const v1::Window& w, RegionId region, WindowSum* sum) {
+  WindowMeasure& m = sum->measure;
+  m.t = kWindowSeconds * static_cast<double>(w.index() + 1);
+  if (m.slowest == kNoRegion || w.process_cpu().max_ms() > m.max_frame_ms) m.slowest = region;
+  m.max_frame_ms = std::max(m.max_frame_ms, w.process_cpu().max_ms());
+  m.mean_frame_ms = std::max(m.mean_frame_ms, w.process_cpu().mean_ms());
+  m.max_thread_ms = std::max(m.max_thread_ms, w.thread_cpu().max_ms());
+  m.mean_thread_ms = std::max(m.mean_thread_ms, w.thread_cpu().mean_ms());
+  m.max_wall_ms = std::max(m.max_wall_ms, w.wall().max_ms());
+  m.bodies += w.bodies();
+  sum->ticks = std::max(sum->ticks, w.process_cpu().ticks());
+}
+
+}  // namespace
+
+double RunMeasure::AwayFromHome() const {
+  return body_ticks > 0 ? static_cast<double>(away_body_ticks) / static_cast<double>(body_ticks) : 0;
+}
+
+std::optional<double> RunMeasure::TransfersPerHomeCrossing() const {
+  if (home_crossings == 0) return std::nullopt;
+  return static_cast<double>(bodies_moved) / static_cast<double>(home_crossings);
+}
+
+RunMeasure Measure(const RunResult& result, int64_t tick_us) {
+  RunMeasure out;
+  out.hashes = result.hashes;
+  out.wall_seconds = result.wall_seconds;
+
+  std::map<int64_t, WindowSum> windows;
+  for (size_t r = 0; r < result.windows.size(); ++r) {
+    for (const v1::Window& w : result.windows[r]) Add(w, static_cast<RegionId>(r), &windows[w.index()]);
+  }
+  const double full_ticks = kWindowSeconds * 1e6 / static_cast<double>(tick_us);
+  if (windows.size() > 1 && static_cast<double>(windows.rbegin()->second.ticks) < full_ticks / 2) {
+    windows.erase(std::prev(windows.end()));
+  }
+  for (const auto& [index, sum] : windows) out.windows.push_back(sum.measure);
+  const int64_t last_window = windows.empty() ? -1 : windows.rbegin()->first;
+
+  bool any_slack = false;
+  for (size_t r = 0; r < result.status.regions.size(); ++r) {
+    const v1::Report& report = result.status.regions[r].report;
+    RegionMeasure region;
+    region.region = static_cast<RegionId>(r);
+    region.bodies = report.bodies();
+    region.largest_cluster = report.largest_cluster();
+    region.largest_component = report.largest_component();
+    region.longest_chain = report.longest_chain();
+    if (r < result.windows.size()) {
+      for (const v1::Window& w : result.windows[r]) {
+        if (w.index() == last_window) region.last_max_frame_ms = w.process_cpu().max_ms();
+      }
+    }
+    out.regions.push_back(region);
+    out.bodies += report.bodies();
+    out.violations += report.violations();
+    out.transfers += report.transfers();
+    out.touching_transfers += report.touching_transfers();
+    out.bodies_moved += report.bodies_moved();
+    out.home_crossings += report.home_crossings();
+    out.largest_cluster = std::max(out.largest_cluster, report.largest_cluster());
+    out.largest_component = std::max(out.largest_component, report.largest_component());
+    out.longest_chain = std::max(out.longest_chain, report.longest_chain());
+    out.away_body_ticks += report.away_body_ticks();
+    out.body_ticks += report.body_ticks();
+    out.bytes_sent += report.bytes_sent();
+    out.waits += report.waits();
+    out.wait_us += report.wait_us();
+    if (report.transfers() > 0) {
+      out.slack_min = any_slack ? std::min(out.slack_min, report.slack_min()) : report.slack_min();
+      any_slack = true;
+    }
+  }
+  return out;
+}
+
+RunMeasure MeanOf(std::span<const RunMeasure> repeats) {
+  RunMeasure out = repeats.front();
+  for (const RunMeasure& m : repeats.subspan(1)) {
+    out.windows.resize(std::min(out.windows.size(), m.windows.size()));
+    for (size_t i = 0; i < out.windows.size(); ++i) {
+      WindowMeasure& w = out.windows[i];
+      const WindowMeasure& add = m.windows[i];
+      w.max_frame_ms += add.max_frame_ms;
+      w.mean_frame_ms += add.mean_frame_ms;
+      w.max_thread_ms += add.max_thread_ms;
+      w.mean_thread_ms += add.mean_thread_ms;
+      w.max_wall_ms += add.max_wall_ms;
+    }
+    for (size_t r = 0; r < out.regions.size() && r < m.regions.size(); ++r) {
+      out.regions[r].last_max_frame_ms += m.regions[r].last_max_frame_ms;
+    }
+    out.violations = std::max(out.violations, m.violations);
+    out.wall_seconds += m.wall_seconds;
+  }
+  const double n = static_cast<double>(repeats.size());
+  for (WindowMeasure& w : out.windows) {
+    for (double* v : {&w.max_frame_ms, &w.mean_frame_ms, &w.max_thread_ms, &w.mean_thread_ms, &w.max_wall_ms}) *v /= n;
+  }
+  for (RegionMeasure& r : out.regions) r.last_max_frame_ms /= n;
+  out.wall_seconds /= n;
+  return out;
+}
+
+Comparison Compare(const RunMeasure& split, const RunMeasure& undivided, Tick last_tick) {
+  Comparison out;
+  std::map<Tick, TickSum> have;
+  for (const TickSum& sum : split.hashes) {
+    if (sum.regions == static_cast<int>(split.regions.size())) have[sum.tick] = sum;
+  }
+  bool at_end = false;
+  out.hash_equal = true;
+  for (const TickSum& want : undivided.hashes) {
+    const auto found = have.find(want.tick);
+    const bool equal = found != have.end() && found->second.hash == want.hash;
+    if (found != have.end()) {
+      ++out.ticks;
+      out.lost = std::max(out.lost, want.bodies - found->second.bodies);
+      out.doubled = std::max(out.doubled, found->second.bodies - want.bodies);
+    }
+    if (!equal && out.hash_equal) {
+      out.hash_equal = false;
+      out.first_difference = want.tick;
+    }
+    at_end |= want.tick == last_tick;
+  }
+  if (!at_end) out.hash_equal = false;
+  return out;
+}
+
+}  // namespace aureole

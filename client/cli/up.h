@@ -1,0 +1,26 @@
+// `aureole up`: runs a world on region servers of its own and shows it.
+#pragma once
+
+#include <string>
+
+#include <CLI/CLI.hpp>
+
+namespace aureole {
+
+struct UpOptions {
+  std::string world;
+  double duration_s = 0;  // of simulated time; 0: until interrupted
+  bool no_real_time = false;
+  bool json = false;
+  bool undivided = false;
+  bool verbose = false;
+  int64_t hash_every = -1;  // ticks; -1: 100 when there is a duration, else none
+  std::string logs, region_server;
+};
+
+// Adds the command to `app`; `options` outlives it.
+CLI::App* AddUp(CLI::App& app, UpOptions* options);
+// Returns an exit code. Signals must be caught already (CatchInterrupts).
+int Up(const UpOptions& options);
+
+}  // namespace aureole

@@ -1,0 +1,43 @@
+// Starts and watches the servers of a world's regions. LocalAllocator runs them as processes of this machine; tests run
+// them as threads; a cluster's scheduler is the next one.
+#pragma once
+
+#include <string>
+#include <vector>
+
+#include <absl/status/status.h>
+
+#include "server/core/types.h"
+
+namespace aureole {
+
+struct ServerStart {
+  RegionId region = kNoRegion;
+  std::string token;    // what the server says in its Hello
+  std::string control;  // where it says it, host:port
+};
+
+struct ServerExit {
+  RegionId region = kNoRegion;
+  bool clean = false;    // exit status 0
+  std::string how;       // "exit status 3", "killed by signal 9 (Killed)"
+  std::string log;       // where all that it wrote is kept; empty when nowhere
+  std::string log_tail;  // the last lines of it, may be empty
+};
+
+// One thread at a time: the one that made it.
+class Allocator {
+ public:
+  // Leaves no server behind.
+  virtual ~Allocator() = default;
+
+  // Returns once the server is started, not once it has joined. NotFound or Internal say why it could not.
+  virtual absl::Status Start(const ServerStart& start) = 0;
+  // Servers that ended since the last call. Call it several times a second.
+  virtual std::vector<ServerExit> Poll() = 0;
+  virtual int running() const = 0;
+  // Ends every server at once, without a chance to say goodbye, and waits until all are gone.
+  virtual void Kill() = 0;
+};
+
+}  // namespace aureole

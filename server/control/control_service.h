@@ -1,0 +1,85 @@
+// The control plane's side of a run (control.proto): servers join, get their assignments, start together, report.
+#pragma once
+
+#include <chrono>
+#include <condition_variable>
+#include <cstdint>
+#include <deque>
+#include <map>
+#include <memory>
+#include <mutex>
+#include <string>
+#include <vector>
+
+#include <absl/status/status.h>
+
+#include "aureole/v1/control.grpc.pb.h"
+#include "server/control/run_status.h"
+
+namespace aureole {
+
+inline constexpr uint32_t kControlProtocolVersion = 1;
+
+// What the servers of one run are told.
+struct RunPlan {
+  v1::WorldSpec world;
+  std::vector<std::string> tokens;  // one per region; what a server says to be that region
+  bool undivided = false;           // one region, whatever the layout says; then there is one token
+  bool no_real_time = false;
+  Tick last_tick = 0;                          // 0: no end
+  Tick hash_every = 0;                         // ticks; 0: never
+  std::chrono::milliseconds start_delay{300};  // from the last Ready to tick 0
+};
+
+// Serves one run. Thread-safe; no call blocks, except Wait. Shut the gRPC server down before this goes.
+class ControlService final : public v1::Control::CallbackService {
+ public:
+  explicit ControlService(RunPlan plan);
+  ~ControlService() override;
+
+  grpc::ServerBidiReactor<v1::FromRegion, v1::ToRegion>* Join(grpc::CallbackServerContext* context) override;
+
+  RunStatus Status() const;
+  // Ascending by tick. Only the newest 2^20 are kept.
+  std::vector<TickSum> Hashes() const;
+  // Of one region, in order. Only the newest 4096 are kept.
+  std::vector<v1::Window> Windows(RegionId region) const;
+  // The first 64.
+  std::vector<v1::Violation> Violations() const;
+  // Returns when something other than a plain report has happened since the last call, or after `longest`.
+  void Wait(std::chrono::milliseconds longest);
+  // Tells every server that is here to end.
+  void Stop(const std::string& reason);
+
+ private:
+  class Session;
+  struct RegionRecord {
+    RegionStatus status;
+    Session* session = nullptr;
+    std::deque<v1::FrameTime> recent;
+    std::deque<v1::Window> windows;
+    Tick last_hash = -1;
+  };
+
+  // Handles one message of a session; an error ends the session and changes nothing else.
+  absl::Status Handle(Session* session, const v1::FromRegion& message);
+  absl::Status HandleHello(Session* session, const v1::Hello& hello);
+  absl::Status HandleReady(RegionRecord* record, const v1::Ready& ready);
+  absl::Status HandleReport(RegionRecord* record, const v1::Report& report);
+  void Leave(Session* session);
+  void AssignAll();
+  void StartAll();
+  void Changed();
+
+  const RunPlan plan_;
+  mutable std::mutex mutex_;  // guards everything below, and the sessions' own fields
+  std::condition_variable changed_;
+  uint64_t changes_ = 0, seen_ = 0;
+  int sessions_ = 0;  // alive
+  Stage stage_ = Stage::kJoining;
+  std::vector<RegionRecord> regions_;
+  std::map<Tick, TickSum> hashes_;
+  std::vector<v1::Violation> violations_;
+};
+
+}  // namespace aureole

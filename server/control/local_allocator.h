@@ -1,0 +1,64 @@
+// Region servers as processes of this machine.
+#pragma once
+
+#include <sys/types.h>
+
+#include <filesystem>
+#include <string>
+#include <vector>
+
+#include "server/control/allocator.h"
+
+namespace aureole {
+
+// Every server is a child in a process group of its own, so that Ctrl-C reaches only the parent, which then stops them
+// in order. The kernel kills them when the thread that started them ends, however it ends: keep that thread alive.
+class LocalAllocator final : public Allocator {
+ public:
+  struct Options {
+    // The region server; empty: `aureole-region` in the directory of this program.
+    std::filesystem::path executable;
+    // Where servers log, one file per region; made when missing and kept. Empty: a temporary directory, which is
+    // removed at the end unless a server ended badly.
+    std::filesystem::path log_directory;
+    // Repeats what the servers log on stderr, each line after its region.
+    bool verbose = false;
+  };
+  explicit LocalAllocator(Options options);
+  ~LocalAllocator() override;
+  LocalAllocator(const LocalAllocator&) = delete;
+  LocalAllocator& operator=(const LocalAllocator&) = delete;
+
+  absl::Status Start(const ServerStart& start) override;
+  std::vector<ServerExit> Poll() override;
+  int running() const override { return static_cast<int>(children_.size()); }
+  void Kill() override;
+
+  std::filesystem::path LogFile(RegionId region) const;
+  // For tests and messages.
+  std::vector<pid_t> pids() const;
+
+ private:
+  struct Child {
+    RegionId region = kNoRegion;
+    pid_t pid = 0;
+  };
+  struct Log {
+    RegionId region = kNoRegion;
+    std::streamoff shown = 0;  // bytes already repeated on stderr
+  };
+  absl::Status Prepare();
+  void RepeatLogs();
+  ServerExit Describe(const Child& child, int wait_status);
+
+  Options options_;
+  bool temporary_ = false;  // options_.log_directory is ours to remove
+  bool bad_exit_ = false;
+  std::vector<Child> children_;  // running, ascending by region
+  std::vector<Log> logs_;
+};
+
+// The last `lines` lines of a text file, without the final newline; empty when it cannot be read.
+std::string TailOfFile(const std::filesystem::path& path, int lines);
+
+}  // namespace aureole

@@ -1,0 +1,82 @@
+// aureole-control: the control plane as a process of its own, with region servers as local processes. It logs plain
+// lines; `aureole up` is the same with a table.
+#include <CLI/CLI.hpp>
+#include <iostream>
+#include <optional>
+
+#include <absl/strings/str_format.h>
+#include <absl/time/time.h>
+
+#include "server/control/interrupts.h"
+#include "server/control/local_allocator.h"
+#include "server/control/run.h"
+#include "server/control/world_file.h"
+
+namespace {
+
+constexpr int kOk = 0, kFailed = 1, kBadInput = 2;
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  aureole::CatchInterrupts();
+  CLI::App app{"Runs one world on region servers that it starts on this machine."};
+  app.footer(
+      "Example:\n  aureole-control tests/worlds/demo.json --listen 127.0.0.1:7000\n\n"
+      "Exit codes: 0 it ran, 1 the run failed, 2 bad input (then nothing was started).");
+  std::string world_path, duration;
+  aureole::RunOptions options;
+  aureole::LocalAllocator::Options servers;
+  app.add_option("world", world_path, "World file (JSON)")->required();
+  app.add_option("--listen", options.listen, "Where region servers join, host:port; port 0 is any")
+      ->capture_default_str();
+  app.add_option("--duration", duration, "Simulated time, such as 60s or 2m; until interrupted when not given");
+  app.add_option("--hash-every", options.hash_every, "Ticks between state hashes; 0 for none")
+      ->check(CLI::NonNegativeNumber);
+  app.add_flag("--no-real-time", options.no_real_time, "As fast as it can");
+  app.add_option("--region-server", servers.executable, "Program to start; beside this one when not given");
+  app.add_option("--logs", servers.log_directory, "Directory for the servers' logs; kept");
+  try {
+    app.parse(argc, argv);
+  } catch (const CLI::ParseError& e) {
+    return app.exit(e) == 0 ? kOk : kBadInput;
+  }
+  const absl::StatusOr<aureole::WorldFile> file = aureole::OpenWorldFile(world_path);
+  if (!file.ok()) {
+    std::cerr << file.status().message() << '\n';
+    return kBadInput;
+  }
+  absl::Duration length;
+  if (!duration.empty() && (!absl::ParseDuration(duration, &length) || length <= absl::ZeroDuration() ||
+                            length == absl::InfiniteDuration())) {
+    std::cerr << "--duration: '" << duration << "' is not a time such as 60s, 2m or 500ms\n";
+    return kBadInput;
+  }
+  options.world = file->spec;
+  options.regions = file->world.layout.size();
+  const int64_t tick_us = file->world.environment.tick_us;
+  if (!duration.empty()) options.last_tick = aureole::TicksIn(absl::ToDoubleSeconds(length), tick_us);
+
+  servers.verbose = true;
+  aureole::LocalAllocator allocator(servers);
+  aureole::RunResult result;
+  aureole::Stage stage = aureole::Stage::kFinished;
+  const absl::Status status = aureole::RunWorld(
+      options, allocator,
+      [&stage](const aureole::RunStatus& now) {
+        if (now.stage != stage) {
+          constexpr const char* kNames[] = {"starting", "loading", "running", "finished"};
+          std::cerr << "[control] " << kNames[static_cast<int>(now.stage)] << ", " << now.regions.size()
+                    << " regions\n";
+          stage = now.stage;
+        }
+        return aureole::Interrupts() == 0;
+      },
+      &result);
+  if (!status.ok() && !absl::IsCancelled(status)) {
+    std::cerr << "[control] " << status.message() << '\n';
+    return kFailed;
+  }
+  std::cerr << absl::StrFormat("[control] %d ticks, %d bodies\n", result.status.MinTick(), result.status.Bodies());
+  return kOk;
+}

@@ -1,0 +1,48 @@
+// One run of a world on servers of its own, from the first process to the last: what `aureole up`, `aureole experiment`
+// and aureole-control have in common.
+#pragma once
+
+#include <chrono>
+#include <functional>
+#include <string>
+#include <vector>
+
+#include <absl/status/status.h>
+
+#include "server/control/allocator.h"
+#include "server/control/control_service.h"
+#include "server/control/run_status.h"
+
+namespace aureole {
+
+struct RunOptions {
+  v1::WorldSpec world;
+  int regions = 1;  // of the world's layout
+  bool undivided = false;
+  bool no_real_time = false;
+  Tick last_tick = 0;   // 0: until interrupted
+  Tick hash_every = 0;  // ticks; 0: never
+  std::string listen = "127.0.0.1:0";
+  std::chrono::seconds join_timeout{120};  // from the start of the servers to the last Ready
+  std::chrono::seconds stop_timeout{10};   // from Stop to the end of the last server, which is then killed
+};
+
+struct RunResult {
+  RunStatus status;
+  std::vector<TickSum> hashes;
+  std::vector<std::vector<v1::Window>> windows;  // by region
+  std::vector<v1::Violation> violations;         // the first 64
+  double wall_seconds = 0;                       // from Start to the end
+};
+
+// Called about ten times a second, on the caller's thread; false interrupts the run.
+using RunObserver = std::function<bool(const RunStatus&)>;
+
+// Runs until every region has finished, the observer says so, or something fails; in every case no server is left when
+// it returns; a second interrupt (interrupts.h) makes short work of servers that take their time. `result` holds what
+// was reported until then. Cancelled: the observer ended it. Aborted: a server ended or left before its time; the
+// message names the region, how it ended and the tail of its log. DeadlineExceeded: the servers did not join, or did
+// not end, in time. Unavailable: the control plane's port cannot be opened.
+absl::Status RunWorld(const RunOptions& options, Allocator& allocator, const RunObserver& observe, RunResult* result);
+
+}  // namespace aureole

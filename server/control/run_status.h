@@ -1,0 +1,59 @@
+// What the control plane knows of a running world. Plain values, copied out of ControlService.
+#pragma once
+
+#include <chrono>
+#include <cstdint>
+#include <deque>
+#include <string>
+#include <vector>
+
+#include "aureole/v1/control.pb.h"
+#include "server/core/types.h"
+
+namespace aureole {
+
+enum class Stage : uint8_t {
+  kJoining,   // not all servers have said Hello
+  kLoading,   // not all servers are Ready
+  kRunning,   // Start was sent
+  kFinished,  // every server has reported its last tick
+};
+
+struct RegionStatus {
+  bool joined = false, ready = false, finished = false;
+  bool left = false;    // its stream has ended
+  std::string goodbye;  // the reason it gave, if any
+  std::string endpoint, metrics_endpoint;
+  int64_t pid = 0;
+  // The newest report, without its hashes, windows and violations. Before the first one: `bodies` of its Ready.
+  v1::Report report;
+  v1::FrameTime frame;          // over the last second or so: mean of the means, largest p99 and maximum
+  double bytes_per_second = 0;  // frame payload sent, between the last two reports
+  std::chrono::steady_clock::time_point reported;  // when the newest report came, or the start
+};
+
+// One tick of the whole world: sums over the regions.
+struct TickSum {
+  Tick tick = 0;
+  uint64_t hash = 0;
+  int64_t bodies = 0;
+  int regions = 0;  // that have reported this tick; complete when all have
+};
+
+struct RunStatus {
+  Stage stage = Stage::kJoining;
+  std::vector<RegionStatus> regions;
+
+  Tick MinTick() const;
+  Tick MaxTick() const;
+  int64_t Bodies() const;
+  int64_t Awake() const;
+  // One clause for each thing that the run waits for, empty when it flows: "region 2 waits for region 1",
+  // "nothing heard of region 1 for 2.3 s", "region 0 has not joined".
+  std::vector<std::string> Waiting() const;
+};
+
+// Merges reports of consecutive intervals: tick-weighted mean, largest p99 and maximum.
+v1::FrameTime Merge(const std::deque<v1::FrameTime>& parts);
+
+}  // namespace aureole

@@ -1,0 +1,117 @@
+// The physics engine as the protocol needs it. Two implementations: ToyEngine (fast, for the cluster simulation) and
+// BulletEngine (server/physics).
+//
+// Determinism contract. The result of Step for a contact component (bodies joined by overlapping exact boxes or by
+// joints) is a pure function of that component's own state, of the environment and of the tick: neither bodies outside
+// of it, nor creation order, nor the history of Extract and Restore may change a bit (EXACT.md). Nothing is promised
+// between two machines that run different binaries.
+//
+// One thread at a time; no call blocks. A broken precondition stops the process.
+#pragma once
+
+#include <cstdint>
+#include <memory>
+#include <span>
+#include <string>
+#include <string_view>
+#include <vector>
+
+#include <absl/status/status.h>
+
+#include "server/core/scene.h"
+#include "server/core/types.h"
+
+namespace aureole {
+
+// Half-open rectangle in x and z; y is unbounded; outer edges may be infinite.
+struct Rect {
+  double min_x = 0, max_x = 0, min_z = 0, max_z = 0;
+
+  bool Contains(double x, double z) const { return x >= min_x && x < max_x && z >= min_z && z < max_z; }
+  // Whether the box lies wholly in the closed rectangle shrunk by `margin` on each finite side.
+  bool Encloses(const Box& b, double margin) const {
+    return b.min.x() >= min_x + margin && b.max.x() <= max_x - margin && b.min.z() >= min_z + margin &&
+           b.max.z() <= max_z - margin;
+  }
+  // Chebyshev distance in x, z from the box to the closed rectangle; zero or less iff they meet.
+  double Gap(const Box& b) const {
+    return std::max(std::max(min_x - b.max.x(), b.min.x() - max_x), std::max(min_z - b.max.z(), b.min.z() - max_z));
+  }
+};
+
+// What the protocol knows of one body.
+struct BodyView {
+  BodyId id = 0;
+  Box box;            // the exact box that the next Step's contact filter uses (breaking margin included)
+  Vec3 centre;        // centre of mass
+  double radius = 0;  // of the sphere about `centre` that bounds `box` in every orientation of the body
+  Vec3 velocity;      // m/s
+  double mass = 0;    // kg
+  bool asleep = false;
+};
+
+// What an observer sees of one body. Not for the tick.
+struct BodyPose {
+  Vec3 position;  // of the centre of mass
+  Quat orientation = Quat::Identity();
+  Vec3 velocity;  // m/s
+  bool asleep = false;
+  std::shared_ptr<const Shape> shape;
+};
+
+struct EngineCounts {
+  int64_t bodies = 0;  // dynamic
+  int64_t awake = 0;
+  int64_t contacts = 0;  // contact points
+};
+
+class Engine {
+ public:
+  virtual ~Engine() = default;
+
+  // Adds a dynamic body that is not there yet.
+  virtual void Spawn(const BodySpec& body) = 0;
+  // Adds a joint whose bodies are here.
+  virtual void Join(const JointSpec& joint) = 0;
+  // Applies one input to bodies that are here (a spawn's body must not be). Inputs of a tick come in their order.
+  virtual void Apply(const Input& input) = 0;
+
+  // Simulates tick `n`, from state n-1 to state n. Kinematic bodies move from their script's pose at n-1 to that at n.
+  virtual void Step(Tick n) = 0;
+
+  virtual bool Contains(BodyId id) const = 0;
+  // Precondition of the four below: Contains(id).
+  virtual BodyView View(BodyId id) const = 0;
+  virtual BodyPose Pose(BodyId id) const = 0;
+  // Of everything that decides the body's future: pose, velocities, sleep state and timer. Equal states, equal hashes.
+  virtual uint64_t Hash(BodyId id) const = 0;
+  // Bodies that share a joint with it, ascending, appended.
+  virtual void Jointed(BodyId id, std::vector<BodyId>* out) const = 0;
+
+  // Ids of all dynamic bodies, ascending. Linear; for hashes and snapshots, not for the tick.
+  virtual std::vector<BodyId> Ids() const = 0;
+  // Dynamic bodies whose exact box is not wholly inside `interior` shrunk by `margin`, ascending, appended. Costs a
+  // few comparisons per awake body; sleeping bodies inside cost nothing.
+  virtual void CollectOutside(const Rect& interior, double margin, std::vector<BodyId>* out) const = 0;
+  // Dynamic bodies whose exact box meets `box`, ascending, appended. Costs O(log bodies + hits).
+  virtual void Query(const Box& box, std::vector<BodyId>* out) const = 0;
+  // Largest BodyView::radius of any body that ever was here.
+  virtual double MaxRadius() const = 0;
+
+  // The whole state of these bodies (ascending ids): description, pose, velocities, sleep timer, forces, cached contact
+  // points among them, joints among them. A set must be closed under joints and overlapping boxes. Extract also removes
+  // them, without waking anybody (P59).
+  virtual std::string Save(std::span<const BodyId> ids) const = 0;
+  virtual std::string Extract(std::span<const BodyId> ids) = 0;
+  // Adds what Save or Extract wrote. InvalidArgument when the bytes are not such a state, or a body is already here;
+  // then nothing has changed.
+  virtual absl::Status Restore(std::string_view state) = 0;
+
+  // An engine of the same kind and environment without dynamic bodies; shares what is immutable. Used to step a cluster
+  // on its own.
+  virtual std::unique_ptr<Engine> Scratch() const = 0;
+
+  virtual EngineCounts Counts() const = 0;
+};
+
+}  // namespace aureole

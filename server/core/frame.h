@@ -1,0 +1,92 @@
+// The one kind of message on a link between two regions, as values. Transport turns it into protobuf and back.
+#pragma once
+
+#include <cstdint>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "server/core/scene.h"
+#include "server/core/types.h"
+
+namespace aureole {
+
+// Closed box in single precision, rounded outward, so that it contains the box it was made from.
+struct WireBox {
+  float min[3] = {0, 0, 0};
+  float max[3] = {0, 0, 0};
+  friend bool operator==(const WireBox&, const WireBox&) = default;
+};
+WireBox RoundOutward(const Box& box);
+Box Widen(const WireBox& box);
+
+// What a region tells another of one of its bodies. Sent when it differs from what was last told on this link; kept by
+// the receiver until a later frame replaces it or names it in `gone`. A sleeping body therefore costs nothing.
+struct Aura {
+  BodyId id = 0;
+  WireBox box;  // k = 0: the exact box. k >= 1: the box of the bounding sphere, which turning does not change
+  // k >= 1 only.
+  RegionId owner = kNoRegion;  // after the decisions of the frame's tick
+  float velocity[3] = {0, 0, 0};
+  float speed = 0;  // m/s, bound on the speed (R12)
+  bool asleep = false;
+  friend bool operator==(const Aura&, const Aura&) = default;
+};
+
+// Two bodies of different owners whose boxes meet, as the sender sees it (R16a).
+struct Edge {
+  BodyId a = 0, b = 0;  // a < b
+  friend bool operator==(const Edge&, const Edge&) = default;
+};
+
+// A contact component of the sender's own bodies that others may have to know of (R16b).
+struct Fragment {
+  std::vector<BodyId> known;  // members that were told to anybody, or touch a foreign box; ascending, never empty
+  BodyId id = 0;              // smallest id of all members
+  uint32_t bodies = 0;        // all members
+  std::vector<std::pair<RegionId, double>> mass_by_home;  // ascending by region; kg
+  RegionId gives_back = kNoRegion;                        // R20: where it returns to, unless it has an edge
+};
+
+enum class TransferCause : uint8_t {
+  kAuraCollision = 1,     // the paper's AC (Algorithm 1): joins what it may touch
+  kBoundaryTraverse = 2,  // the paper's BT (Algorithm 2): an island goes home
+  kDrain = 3,             // the region is being emptied
+};
+
+// Moves the ownership of a whole cluster. Whole, or not at all (P44).
+struct Transfer {
+  std::vector<BodyId> ids;    // ascending
+  std::vector<Epoch> epochs;  // after the transfer, one per id
+  TransferCause cause = TransferCause::kAuraCollision;
+  std::string state;           // Engine::Extract; of state tick (k = 0), of state tick + k - 1 (k >= 1)
+  std::vector<Input> pending;  // inputs accepted for these bodies that have not taken effect, in order
+};
+
+struct Away {
+  BodyId id = 0;
+  RegionId owner = kNoRegion;
+  WireBox box;
+  friend bool operator==(const Away&, const Away&) = default;
+};
+
+// To every linked region at once.
+inline constexpr RegionId kEveryone = -2;
+
+struct Frame {
+  RegionId from = kNoRegion;
+  RegionId to = kNoRegion;  // or kEveryone
+  Tick tick = 0;
+  int round = 0;  // k = 0: 0 boxes, 1 graph, 2 transfers. k >= 1: 0
+  std::vector<Aura> auras;
+  std::vector<BodyId> gone;
+  std::vector<Edge> edges;
+  std::vector<Fragment> fragments;
+  std::vector<Transfer> transfers;
+  // k >= 1, as changes: boxes of the bodies that the sender projects and that are not wholly inside their owner's
+  // region (PROTOCOL.md section 3c).
+  std::vector<Away> away;
+  std::vector<BodyId> away_gone;
+};
+
+}  // namespace aureole

@@ -1,0 +1,238 @@
+#include "server/core/holdings.h"
+
+#include <algorithm>
+#include <cmath>
+
+#include <absl/strings/str_cat.h>
+
+#include "server/core/check.h"
+
+namespace aureole {
+namespace {
+
+constexpr size_t kMaxViolations = 64;
+constexpr Tick kMaxLead = 64;  // ticks that a peer may be ahead: it waits for us long before
+
+bool Finite(const WireBox& b) {
+  for (int i = 0; i < 3; ++i) {
+    if (!std::isfinite(b.min[i]) || !std::isfinite(b.max[i]) || b.min[i] > b.max[i]) return false;
+  }
+  return true;
+}
+
+template <class List, class Key>
+bool Ascending(const List& list, Key key) {
+  for (size_t i = 0; i < list.size(); ++i) {
+    if (key(list[i]) == 0 || (i > 0 && key(list[i]) <= key(list[i - 1]))) return false;
+  }
+  return true;
+}
+
+absl::Status Malformed(const char* field, const char* why) {
+  return absl::InvalidArgumentError(absl::StrCat("frame.", field, ": ", why));
+}
+
+absl::Status Validate(const Frame& f) {
+  auto identity = [](BodyId id) { return id; };
+  if (!Ascending(f.auras, [](const Aura& a) { return a.id; })) return Malformed("auras", "ids must ascend");
+  for (const Aura& a : f.auras) {
+    if (!Finite(a.box)) return Malformed("auras.box", "must be finite and not inverted");
+  }
+  if (!Ascending(f.gone, identity)) return Malformed("gone", "ids must ascend");
+  if (!Ascending(f.away, [](const Away& a) { return a.id; })) return Malformed("away", "ids must ascend");
+  for (const Away& a : f.away) {
+    if (!Finite(a.box)) return Malformed("away.box", "must be finite and not inverted");
+  }
+  if (!Ascending(f.away_gone, identity)) return Malformed("away_gone", "ids must ascend");
+  for (const Edge& e : f.edges) {
+    if (e.a == 0 || e.a >= e.b) return Malformed("edges", "a must be less than b");
+  }
+  for (const Fragment& g : f.fragments) {
+    if (g.known.empty() || !Ascending(g.known, identity)) return Malformed("fragments.known", "ids must ascend");
+    if (g.mass_by_home.empty()) return Malformed("fragments.mass_by_home", "must not be empty");
+    for (const auto& [home, kg] : g.mass_by_home) {
+      if (!std::isfinite(kg) || kg <= 0) return Malformed("fragments.mass_by_home", "must be > 0 kg");
+    }
+  }
+  for (const Transfer& t : f.transfers) {
+    if (t.ids.empty() || !Ascending(t.ids, identity)) return Malformed("transfers.ids", "must ascend");
+    if (t.ids.size() != t.epochs.size()) return Malformed("transfers.epochs", "one per id");
+  }
+  return absl::OkStatus();
+}
+
+}  // namespace
+
+absl::Status Inbox::Accept(Frame frame, bool synchronous) {
+  if (absl::Status s = Validate(frame); !s.ok()) return s;
+  bool follows = false;
+  if (!synchronous) {
+    follows = frame.round == 0 && frame.tick == tick_ + 1;
+  } else if (frame.round == 0) {
+    follows = frame.tick == std::max<Tick>(tick_, 0) + 1 && round_ >= 1;
+  } else {
+    follows = frame.tick == tick_ && frame.round == round_ + 1 && frame.round <= 2;
+  }
+  if (!follows) {
+    return absl::InvalidArgumentError(absl::StrCat("frame.tick: (", frame.tick, ", round ", frame.round,
+                                                   ") cannot follow (", tick_, ", round ", round_, ")"));
+  }
+  if (!frames_.empty() && frame.tick > frames_.front().tick + kMaxLead) {
+    return absl::InvalidArgumentError(absl::StrCat("frame.tick: ", frame.tick, " is too far ahead"));
+  }
+  tick_ = frame.tick;
+  round_ = frame.round;
+  frames_.push_back(std::move(frame));
+  return absl::OkStatus();
+}
+
+Frame Inbox::Pop() {
+  Frame f = std::move(frames_.front());
+  frames_.pop_front();
+  return f;
+}
+
+Holdings::Holdings(const World& w, RegionId s, std::unique_ptr<Engine> e)
+    : world(w), self(s), rect(w.layout.rect(s)), engine(std::move(e)) {
+  for (RegionId r = 0; r < w.layout.size(); ++r) {
+    if (r == self) continue;
+    peers.push_back(r);
+    inboxes[r];
+  }
+}
+
+void Holdings::LoadInitialState(double margin) {
+  // The boxes come from an engine that holds the whole initial state, so that every region sees the same ones.
+  std::unique_ptr<Engine> all = engine->Scratch();
+  for (const BodySpec& b : world.bodies) all->Spawn(b);
+  std::vector<BodyView> views;
+  for (BodyId id : all->Ids()) {
+    BodyView v = all->View(id);
+    if (margin > 0) v.box = {v.centre.array() - v.radius, v.centre.array() + v.radius};
+    views.push_back(v);
+  }
+  const std::vector<RegionId> owners = InitialOwners(world, views, margin);
+  absl::flat_hash_map<BodyId, RegionId> owner;
+  for (size_t i = 0; i < views.size(); ++i) owner[views[i].id] = owners[i];
+  for (const BodySpec& b : world.bodies) {
+    if (owner.at(b.id) != self) continue;
+    engine->Spawn(b);
+    held[b.id] = {};
+  }
+  for (const JointSpec& j : world.joints) {
+    if (owner.at(j.a) != self) continue;
+    AUREOLE_CHECK(j.b == 0 || owner.at(j.b) == self, "joint %llu has two owners",
+                  static_cast<unsigned long long>(j.id));
+    engine->Join(j);
+  }
+}
+
+void Holdings::ApplyInput(const Input& input) {
+  if (input.kind == Input::Kind::kSpawn) {
+    held.try_emplace(input.spawn->id);
+    engine->Apply(input);
+    return;
+  }
+  if (!held.contains(input.body)) return;
+  engine->Apply(input);
+  if (input.kind == Input::Kind::kRemove) held.erase(input.body);
+}
+
+void Holdings::TakeDueInputs(Tick n, std::vector<Input>* out) {
+  const auto due = std::find_if(pending.begin(), pending.end(), [n](const Input& i) { return i.tick > n; });
+  out->insert(out->end(), pending.begin(), due);
+  pending.erase(pending.begin(), due);
+}
+
+Transfer Holdings::Depart(std::vector<BodyId> ids, RegionId to, TransferCause cause) {
+  Transfer t;
+  t.cause = cause;
+  for (BodyId id : ids) {
+    auto it = held.find(id);
+    AUREOLE_CHECK(it != held.end(), "region %d does not own body %llu", self, static_cast<unsigned long long>(id));
+    t.epochs.push_back(it->second.epoch + 1);
+    held.erase(it);
+    sent_to[id] = to;
+  }
+  for (auto it = pending.begin(); it != pending.end();) {
+    if (std::binary_search(ids.begin(), ids.end(), it->body)) {
+      t.pending.push_back(std::move(*it));
+      it = pending.erase(it);
+    } else {
+      ++it;
+    }
+  }
+  ++stats.transfers_out;
+  stats.bodies_out += static_cast<int64_t>(ids.size());
+  stats.touching_out += ids.size() > 1;
+  stats.returns_out += cause == TransferCause::kBoundaryTraverse;
+  stats.largest_cluster = std::max(stats.largest_cluster, static_cast<int64_t>(ids.size()));
+  t.ids = std::move(ids);
+  return t;
+}
+
+void Holdings::Arrive(const Transfer& t, RegionId from, Tick n) {
+  if (!t.state.empty()) {
+    const absl::Status s = engine->Restore(t.state);
+    AUREOLE_CHECK(s.ok(), "transfer of body %llu from region %d to %d at tick %lld: %s",
+                  static_cast<unsigned long long>(t.ids[0]), from, self, static_cast<long long>(n),
+                  std::string(s.message()).c_str());
+  }
+  for (size_t i = 0; i < t.ids.size(); ++i) {
+    const bool fresh = held.emplace(t.ids[i], Held{t.epochs[i], n}).second;
+    AUREOLE_CHECK(fresh, "body %llu came from region %d but region %d owns it",
+                  static_cast<unsigned long long>(t.ids[i]), from, self);
+    sent_to.erase(t.ids[i]);
+  }
+  pending.insert(pending.end(), t.pending.begin(), t.pending.end());
+  std::sort(pending.begin(), pending.end());
+  ++stats.transfers_in;
+  stats.bodies_in += static_cast<int64_t>(t.ids.size());
+}
+
+void Holdings::Report(const Violation& v) {
+  ++stats.violations;
+  if (violations.size() < kMaxViolations) violations.push_back(v);
+}
+
+void Holdings::CountHomes(std::span<const BodyId> near) {
+  std::vector<std::pair<BodyId, RegionId>> homes;
+  homes.reserve(near.size());
+  stats.away_bodies = 0;
+  auto before = homes_.begin();
+  for (BodyId id : near) {
+    if (!engine->Contains(id)) continue;
+    const RegionId home = world.layout.Home(engine->View(id).centre);
+    while (before != homes_.end() && before->first < id) ++before;
+    // Not in the list: it was inside its home, or it has arrived, and the sender has counted.
+    if (before != homes_.end() && before->first == id) {
+      stats.home_crossings += before->second != home;
+    } else if (held.at(id).arrived < tick) {
+      stats.home_crossings += home != self;
+    }
+    stats.away_bodies += home != self;
+    homes.emplace_back(id, home);
+  }
+  homes_ = std::move(homes);
+}
+
+RegionId Heaviest(const Layout& layout, std::span<const std::pair<RegionId, double>> mass) {
+  RegionId best = kNoRegion;
+  double most = 0;
+  for (const auto& [region, kg] : mass) {
+    if (best == kNoRegion || kg > most || (kg == most && layout.rank(region) < layout.rank(best))) {
+      best = region;
+      most = kg;
+    }
+  }
+  return best;
+}
+
+void AddMass(std::vector<std::pair<RegionId, double>>* mass, RegionId home, double kg) {
+  auto it = std::lower_bound(mass->begin(), mass->end(), home,
+                             [](const std::pair<RegionId, double>& e, RegionId r) { return e.first < r; });
+  if (it == mass->end() || it->first != home) it = mass->insert(it, {home, 0.0});
+  it->second += kg;
+}
+
+}  // namespace aureole

@@ -1,0 +1,101 @@
+// What a region owns, and the bookkeeping that both exchanges share: the engine, epochs, arrivals, inputs, counters.
+#pragma once
+
+#include <deque>
+#include <memory>
+#include <span>
+#include <utility>
+#include <vector>
+
+#include <absl/container/flat_hash_map.h>
+#include <absl/status/status.h>
+#include <absl/status/statusor.h>
+
+#include "server/core/engine.h"
+#include "server/core/frame.h"
+#include "server/core/region.h"
+#include "server/core/world.h"
+
+namespace aureole {
+
+// A body that this region owns.
+struct Held {
+  Epoch epoch = 0;
+  Tick arrived = -1000000;  // tick at which it was transferred here; long ago for what began here
+};
+
+// Frames of one peer that wait for their phase.
+class Inbox {
+ public:
+  // InvalidArgument unless the frame can follow the last one: ticks and rounds only grow, without holes.
+  absl::Status Accept(Frame frame, bool synchronous);
+  const Frame* Front() const { return frames_.empty() ? nullptr : &frames_.front(); }
+  Frame Pop();
+
+ private:
+  std::deque<Frame> frames_;
+  Tick tick_ = -1;
+  int round_ = 2;
+};
+
+struct Holdings {
+  Holdings(const World& w, RegionId s, std::unique_ptr<Engine> e);
+
+  const World& world;
+  const RegionId self;
+  const Rect rect;
+  std::unique_ptr<Engine> engine;
+  std::vector<RegionId> peers;  // ascending
+  absl::flat_hash_map<RegionId, Inbox> inboxes;
+  absl::flat_hash_map<BodyId, Held> held;
+  Tick tick = 0;  // last stepped
+  RegionStats stats;
+  std::vector<Violation> violations;
+
+  // The smallest tick at which an input accepted now takes effect, and what was accepted.
+  std::vector<Input> pending;                     // accepted live inputs that have not taken effect, in Input's order
+  std::vector<Input> accepted;                    // since the last TakeAccepted
+  absl::flat_hash_map<BodyId, RegionId> sent_to;  // tombstones: where a body that was here went (P45)
+
+  // Adds bodies and joints of state 0 that this region owns.
+  void LoadInitialState(double margin);
+  // Every input of tick n that this region applies, in order: scripted ones for bodies held or spawned here, pending
+  // ones. `owns_spawn` says whether a spawn is this region's.
+  void ApplyInput(const Input& input);
+  void TakeDueInputs(Tick n, std::vector<Input>* out);
+  // Extracts a closed set of owned bodies for a new owner.
+  Transfer Depart(std::vector<BodyId> ids, RegionId to, TransferCause cause);
+  // Takes over what a peer sent.
+  void Arrive(const Transfer& transfer, RegionId from, Tick n);
+  void Report(const Violation& v);
+  // Home crossings and bodies away from home among `near` (ascending ids of the bodies that may be either).
+  void CountHomes(std::span<const BodyId> near);
+
+ private:
+  std::vector<std::pair<BodyId, RegionId>> homes_;  // of the bodies near the border, ascending
+};
+
+// Region with the larger value, ties to the better rank; kNoRegion for an empty list.
+RegionId Heaviest(const Layout& layout, std::span<const std::pair<RegionId, double>> mass);
+// Adds to the entry of `home`, keeping the list ascending.
+void AddMass(std::vector<std::pair<RegionId, double>>* mass, RegionId home, double kg);
+
+// The exchange of a region: synchronous (k = 0) or with a fixed delay (k >= 1). Same meaning as in Region.
+class Protocol {
+ public:
+  virtual ~Protocol() = default;
+  virtual Phase phase() const = 0;
+  virtual bool Ready() const = 0;
+  virtual void Missing(std::vector<RegionId>* out) const = 0;
+  virtual void Advance(std::vector<Frame>* out) = 0;
+  // Appends what is in flight from here: stepped by nobody's engine in tick `tick() + 1` (before its step), or in state
+  // `tick()`.
+  virtual void ObserveInFlight(std::vector<BodyRecord>* out) const = 0;
+  // The tick at which an input accepted now may take effect.
+  virtual Tick EffectTick(const Input& input) const = 0;
+};
+
+std::unique_ptr<Protocol> MakeSyncExchange(Holdings& holdings);
+std::unique_ptr<Protocol> MakeDelayedExchange(Holdings& holdings);
+
+}  // namespace aureole

@@ -1,0 +1,116 @@
+// One region of a world: a state machine that steps its bodies and exchanges frames with its peers. No clock, thread,
+// socket, file or log; the whole distributed run is a pure function of the world and of the accepted inputs.
+//
+// A tick runs in phases. Each phase needs certain frames of the peers; Advance runs it and yields frames to send:
+//   k = 0   kBegin: inputs, boxes -> round 0.  kGraph: needs round 0 of all -> round 1.  kDecide: needs round 1 of all
+//           -> round 2 to those that get a transfer.  kArrive: needs round 2 of those that send one.  kStep.
+//   k >= 1  kBegin: needs the frames of tick n-k of all; applies them and the inputs.  kStep: steps, detects, decides,
+//           -> the frames of tick n.
+// (PROTOCOL.md sections 4 and 10; the tick order is P22.)
+#pragma once
+
+#include <cstdint>
+#include <memory>
+#include <string>
+#include <vector>
+
+#include <absl/status/status.h>
+#include <absl/status/statusor.h>
+
+#include "server/core/engine.h"
+#include "server/core/frame.h"
+#include "server/core/world.h"
+
+namespace aureole {
+
+enum class Phase : uint8_t { kBegin, kGraph, kDecide, kArrive, kStep };
+
+// Counters since the start. "Touching": the cluster had more than one body.
+struct RegionStats {
+  int64_t transfers_out = 0, transfers_in = 0;
+  int64_t bodies_out = 0, bodies_in = 0;
+  int64_t touching_out = 0;           // transfers of clusters of at least two bodies
+  int64_t returns_out = 0;            // of transfers_out, those of cause kBoundaryTraverse
+  int64_t largest_cluster = 0;        // most bodies in one transfer
+  int64_t largest_component = 0;      // most bodies of one merged component that touched more than one owner (k = 0)
+  int64_t longest_chain = 0;          // most owners met in one component
+  int64_t auras_sent = 0;             // aura updates, all links
+  int64_t auras_told = 0;             // auras that peers hold of us now
+  int64_t aura_tests = 0;             // bodies tested against other regions or foreign boxes
+  int64_t exchanges_ended_early = 0;  // k = 0: ticks without a third exchange
+  int64_t home_crossings = 0;
+  int64_t away_bodies = 0;  // owned now, centre outside the home rectangle
+  int64_t violations = 0;   // broken horizons (I4), each also in Region::violations()
+  int64_t crossings = 0;    // R7
+  double slack_min = 0;     // k >= 1: smallest gap between own and foreign exact boxes when co-hosted
+};
+
+// A horizon that was broken: two bodies that were stepped apart although their exact boxes met.
+struct Violation {
+  Tick tick = 0;
+  BodyId own = 0, foreign = 0;
+  double depth = 0;  // m
+  double speed = 0;  // m/s, the faster of the two
+};
+
+// One body as an observer sees it. For tests, hashes and clients; not for the tick.
+struct BodyRecord {
+  BodyId id = 0;
+  Epoch epoch = 0;
+  uint64_t hash = 0;
+  // Bodies with equal groups are stepped together in the next step. Regions are 0..n-1; a cluster in flight that is
+  // stepped on its own has a group of its own, negative.
+  int64_t group = 0;
+  Box box;
+};
+
+class Region {
+ public:
+  // `engine` holds the world's environment and no dynamic body; the region loads its share of the initial state.
+  // `world` outlives the region.
+  Region(const World& world, RegionId self, std::unique_ptr<Engine> engine);
+  ~Region();
+  Region(const Region&) = delete;
+  Region& operator=(const Region&) = delete;
+
+  RegionId self() const;
+  // The last tick that was stepped.
+  Tick tick() const;
+  Phase phase() const;
+  // Every region this one exchanges frames with, ascending. (All others: the graph of k = 0 is broadcast, R16.)
+  const std::vector<RegionId>& peers() const;
+
+  // Takes the next frame of a peer. Frames of one peer come in the order it sent them, each once. InvalidArgument when
+  // the frame cannot be one of the protocol's (wrong sender, tick, round, box, id); then nothing changes.
+  absl::Status Receive(Frame frame);
+  // Whether Advance may be called. At kBegin the caller also decides when it is time for the tick.
+  bool Ready() const;
+  // Peers whose frame the next phase still needs, ascending, appended.
+  void Missing(std::vector<RegionId>* out) const;
+  // Runs one phase and appends the frames to send. Precondition: Ready().
+  void Advance(std::vector<Frame>* out);
+
+  // Accepts a live input (source > 0) for a body that this region owns, or a spawn whose place is in this region. It
+  // takes effect at the earliest safe tick, which is returned. NotFound when the body is not here: the message names
+  // the region it was sent to, if known.
+  absl::StatusOr<Tick> Submit(Input input);
+  // Accepted live inputs with their ticks, in order of acceptance, since the last call.
+  std::vector<Input> TakeAccepted();
+
+  // All bodies that this region accounts for: at kStep those that it is about to step, else those of state tick();
+  // k >= 1: also those in flight from here that are not yet applied elsewhere.
+  void Observe(std::vector<BodyRecord>* out) const;
+  // Sum over these bodies of a hash of (id, hash): add the regions' values to get the world's (I6).
+  uint64_t StateHash() const;
+
+  const RegionStats& stats() const;
+  // Since the last call, at most 64.
+  std::vector<Violation> TakeViolations();
+  const Engine& engine() const;
+
+ private:
+  struct Impl;
+  std::unique_ptr<Impl> impl_;
+};
+
+}  // namespace aureole

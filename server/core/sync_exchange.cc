@@ -1,0 +1,421 @@
+// The synchronous exchange, k = 0 (PROTOCOL.md section 10, form A): inside one tick, on states that stand still, boxes
+// -> graph -> transfers. Nothing is predicted, so there is no speed tolerance, and three exchanges are enough for any
+// layout.
+#include <algorithm>
+#include <iterator>
+#include <map>
+#include <set>
+
+#include <absl/container/flat_hash_map.h>
+#include <absl/container/flat_hash_set.h>
+
+#include "server/core/check.h"
+#include "server/core/holdings.h"
+#include "server/core/union_find.h"
+
+namespace aureole {
+namespace {
+
+// Boxes are tested against regions with this to spare, so that the two comparisons of R15 cannot disagree by rounding;
+// metres.
+constexpr double kSpare = 1e-3;
+
+class SyncExchange final : public Protocol {
+ public:
+  explicit SyncExchange(Holdings& holdings) : h_(holdings) {}
+
+  Phase phase() const override { return phase_; }
+
+  bool Ready() const override {
+    for (RegionId p : h_.peers) {
+      if (!HasFrame(p)) return false;
+    }
+    return true;
+  }
+
+  void Missing(std::vector<RegionId>* out) const override {
+    for (RegionId p : h_.peers) {
+      if (!HasFrame(p)) out->push_back(p);
+    }
+  }
+
+  void Advance(std::vector<Frame>* out) override {
+    switch (phase_) {
+      case Phase::kBegin:
+        return Begin(out);
+      case Phase::kGraph:
+        return SendGraph(out);
+      case Phase::kDecide:
+        return Decide(out);
+      case Phase::kArrive:
+        return TakeArrivals();
+      case Phase::kStep:
+        h_.engine->Step(now());
+        ++h_.tick;
+        phase_ = Phase::kBegin;
+    }
+  }
+
+  void ObserveInFlight(std::vector<BodyRecord>*) const override {}
+  Tick EffectTick(const Input&) const override { return phase_ == Phase::kBegin ? now() : now() + 1; }
+
+ private:
+  struct Foreign {
+    BodyId id;
+    RegionId owner;
+    Box box;
+  };
+  // A contact component of own bodies; `wire` is what the others get to know of it.
+  struct Component {
+    Fragment wire;
+    std::vector<BodyId> members;  // ascending
+  };
+
+  Tick now() const { return h_.tick + 1; }
+
+  // The round of the frame that the current phase needs from this peer, -1 for none.
+  int NeededRound(RegionId peer) const {
+    switch (phase_) {
+      case Phase::kGraph:
+        return 0;
+      case Phase::kDecide:
+        return 1;
+      case Phase::kArrive:
+        return senders_.contains(peer) ? 2 : -1;
+      default:
+        return -1;
+    }
+  }
+  bool HasFrame(RegionId peer) const {
+    const int round = NeededRound(peer);
+    if (round < 0) return true;
+    const Frame* f = h_.inboxes.at(peer).Front();
+    if (f == nullptr) return false;
+    AUREOLE_CHECK(f->tick == now() && f->round == round, "region %d sent (%lld, %d) where (%lld, %d) was due", peer,
+                  static_cast<long long>(f->tick), f->round, static_cast<long long>(now()), round);
+    return true;
+  }
+
+  Frame MakeFrame(RegionId to, int round) const {
+    Frame f;
+    f.from = h_.self;
+    f.to = to;
+    f.tick = now();
+    f.round = round;
+    return f;
+  }
+
+  // R13: everything with effect in this tick happens before its exchange. Then R14.
+  void Begin(std::vector<Frame>* out) {
+    inputs_.clear();
+    ScriptedInputs(h_.world, now(), &inputs_);
+    h_.TakeDueInputs(now(), &inputs_);
+    for (const Input& i : inputs_) {
+      // A live spawn is pending only where it was accepted; a scripted one belongs to the home of its place.
+      const bool elsewhere =
+          i.kind == Input::Kind::kSpawn && i.source == 0 && h_.world.layout.Home(i.spawn->position) != h_.self;
+      if (!elsewhere) h_.ApplyInput(i);
+    }
+    near_.clear();
+    h_.engine->CollectOutside(h_.rect, kSpare, &near_);
+    h_.CountHomes(near_);
+    BoundaryNetworkUpdate(out);
+    phase_ = h_.peers.empty() ? Phase::kStep : Phase::kGraph;
+  }
+
+  // The paper's BNU (Algorithm 6), built once per tick (P52). R14: a body is told to every region whose closed
+  // rectangle its exact box touches. OBC, OBU and OBE (Algorithms 3 to 5) are the three outcomes of comparing what a
+  // peer holds with what it must hold: created, updated, destroyed; recomputed as a set each tick (P13).
+  void BoundaryNetworkUpdate(std::vector<Frame>* out) {
+    told_ids_.clear();
+    for (RegionId peer : h_.peers) next_[peer].clear();
+    for (BodyId id : near_) {
+      const Box box = h_.engine->View(id).box;
+      const WireBox wire = RoundOutward(box);
+      bool told = false;
+      for (RegionId peer : h_.peers) {
+        if (h_.world.layout.rect(peer).Gap(box) > kSpare) continue;
+        next_[peer].push_back({id, wire});
+        told = true;
+      }
+      if (told) told_ids_.push_back(id);
+    }
+    h_.stats.aura_tests += static_cast<int64_t>(near_.size());
+    h_.stats.auras_told = 0;
+    for (RegionId peer : h_.peers) {
+      Frame f = MakeFrame(peer, 0);
+      Compare(told_[peer], next_[peer], &f);
+      h_.stats.auras_sent += static_cast<int64_t>(f.auras.size());
+      h_.stats.auras_told += static_cast<int64_t>(next_[peer].size());
+      std::swap(told_[peer], next_[peer]);
+      out->push_back(std::move(f));
+    }
+  }
+
+  using Told = std::vector<std::pair<BodyId, WireBox>>;  // ascending
+
+  static void Compare(const Told& before, const Told& after, Frame* f) {
+    auto b = before.begin();
+    for (const auto& [id, box] : after) {
+      for (; b != before.end() && b->first < id; ++b) DestroyAura(b->first, f);
+      if (b != before.end() && b->first == id) {
+        if (b->second != box) UpdateAura(id, box, f);
+        ++b;
+      } else {
+        CreateAura(id, box, f);
+      }
+    }
+    for (; b != before.end(); ++b) DestroyAura(b->first, f);
+  }
+  static void CreateAura(BodyId id, const WireBox& box, Frame* f) { UpdateAura(id, box, f); }
+  static void UpdateAura(BodyId id, const WireBox& box, Frame* f) {
+    Aura a;
+    a.id = id;
+    a.box = box;
+    f->auras.push_back(a);
+  }
+  static void DestroyAura(BodyId id, Frame* f) { f->gone.push_back(id); }
+
+  // R15, R16: which bodies of different owners meet, as far as this region was told; and its own components that others
+  // may have to move.
+  void SendGraph(std::vector<Frame>* out) {
+    TakeBoxes();
+    Frame f = MakeFrame(kEveryone, 1);
+    std::vector<BodyId> known = told_ids_;
+    FindEdges(&f.edges, &known);
+    std::sort(known.begin(), known.end());
+    known.erase(std::unique(known.begin(), known.end()), known.end());
+    FindComponents(known);
+    for (const Component& c : components_) f.fragments.push_back(c.wire);
+    graph_[h_.self] = f;
+    out->push_back(std::move(f));
+    phase_ = Phase::kDecide;
+  }
+
+  void TakeBoxes() {
+    foreign_.clear();
+    for (RegionId peer : h_.peers) {
+      Frame f = h_.inboxes.at(peer).Pop();
+      auto& boxes = remote_[peer];
+      for (BodyId id : f.gone) boxes.erase(id);
+      for (const Aura& a : f.auras) boxes[a.id] = Widen(a.box);
+      for (const auto& [id, box] : boxes) foreign_.push_back({id, peer, box});
+    }
+    std::sort(foreign_.begin(), foreign_.end(), [](const Foreign& x, const Foreign& y) {
+      return x.box.min.x() != y.box.min.x() ? x.box.min.x() < y.box.min.x() : x.id < y.id;
+    });
+  }
+
+  void FindEdges(std::vector<Edge>* edges, std::vector<BodyId>* touched) {
+    std::vector<BodyId> hits;
+    for (const Foreign& f : foreign_) {
+      hits.clear();
+      h_.engine->Query(f.box, &hits);
+      for (BodyId own : hits) {
+        AUREOLE_CHECK(own != f.id, "body %llu is owned by regions %d and %d", static_cast<unsigned long long>(own),
+                      h_.self, f.owner);
+        edges->push_back({std::min(own, f.id), std::max(own, f.id)});
+        touched->push_back(own);
+      }
+    }
+    // Introductions (R15): two foreign bodies that meet here, whose owners need not know of each other.
+    for (size_t i = 0; i < foreign_.size(); ++i) {
+      for (size_t j = i + 1; j < foreign_.size() && foreign_[j].box.min.x() <= foreign_[i].box.max.x(); ++j) {
+        if (foreign_[i].owner == foreign_[j].owner || !Overlap(foreign_[i].box, foreign_[j].box)) continue;
+        edges->push_back({std::min(foreign_[i].id, foreign_[j].id), std::max(foreign_[i].id, foreign_[j].id)});
+      }
+    }
+    h_.stats.aura_tests += static_cast<int64_t>(foreign_.size());
+    std::sort(edges->begin(), edges->end(),
+              [](const Edge& x, const Edge& y) { return x.a != y.a ? x.a < y.a : x.b < y.b; });
+    edges->erase(std::unique(edges->begin(), edges->end()), edges->end());
+  }
+
+  // The contact components (joints included) of own bodies that hold a known one.
+  void FindComponents(const std::vector<BodyId>& known) {
+    components_.clear();
+    absl::flat_hash_set<BodyId> seen;
+    std::vector<BodyId> reached;
+    for (BodyId seed : known) {
+      if (!seen.insert(seed).second) continue;
+      Component c;
+      c.members.push_back(seed);
+      for (size_t i = 0; i < c.members.size(); ++i) {
+        reached.clear();
+        h_.engine->Query(h_.engine->View(c.members[i]).box, &reached);
+        h_.engine->Jointed(c.members[i], &reached);
+        for (BodyId id : reached) {
+          if (seen.insert(id).second) c.members.push_back(id);
+        }
+      }
+      std::sort(c.members.begin(), c.members.end());
+      c.wire.id = c.members.front();
+      c.wire.bodies = static_cast<uint32_t>(c.members.size());
+      std::set_intersection(c.members.begin(), c.members.end(), known.begin(), known.end(),
+                            std::back_inserter(c.wire.known));
+      for (BodyId id : c.members) {
+        const BodyView v = h_.engine->View(id);
+        AddMass(&c.wire.mass_by_home, h_.world.layout.Home(v.centre), v.mass);
+      }
+      c.wire.gives_back = BoundaryTraverse(c);
+      components_.push_back(std::move(c));
+    }
+  }
+
+  // The paper's BT (Algorithm 2), by R20: an island goes home when none of it meets this region, nothing foreign is
+  // near, and it has been here for a while. Returns its new owner, or kNoRegion.
+  RegionId BoundaryTraverse(const Component& c) const {
+    for (BodyId id : c.members) {
+      if (now() - h_.held.at(id).arrived < h_.world.exchange.Dwell()) return kNoRegion;
+      if (h_.rect.Gap(h_.engine->View(id).box) <= 0) return kNoRegion;
+    }
+    const double gap = h_.world.exchange.return_gap;
+    for (BodyId id : c.members) {
+      const Box box = h_.engine->View(id).box;
+      for (const Foreign& f : foreign_) {
+        if (f.box.min.x() > box.max.x() + gap) break;
+        if (Gap(f.box, box) <= gap) return kNoRegion;
+      }
+    }
+    const RegionId home = Heaviest(h_.world.layout, c.wire.mass_by_home);
+    return home == h_.self ? kNoRegion : home;
+  }
+
+  // R17, R19: all regions hold the same graph, so all find the same components and the same owner for each.
+  void Decide(std::vector<Frame>* out) {
+    for (RegionId peer : h_.peers) graph_[peer] = h_.inboxes.at(peer).Pop();
+    std::map<RegionId, Frame> leaving;
+    senders_.clear();
+    GiveBackIslands(&leaving);
+    AuraCollision(&leaving);
+    for (auto& [to, frame] : leaving) out->push_back(std::move(frame));
+    if (senders_.empty() && leaving.empty()) ++h_.stats.exchanges_ended_early;
+    phase_ = senders_.empty() ? Phase::kStep : Phase::kArrive;
+  }
+
+  struct Node {
+    RegionId owner;
+    int index;  // of the fragment in its owner's graph
+  };
+
+  // The bodies that have an edge, over all graphs.
+  absl::flat_hash_map<BodyId, int> EdgeBodies() const {
+    absl::flat_hash_map<BodyId, int> bodies;
+    for (const auto& [owner, graph] : graph_) {
+      for (const Edge& e : graph.edges) {
+        bodies.emplace(e.a, -1);
+        bodies.emplace(e.b, -1);
+      }
+    }
+    return bodies;
+  }
+
+  // The paper's AC (Algorithm 1), by R17 and R19: every component of more than one owner goes whole to the region that
+  // is home to most of its mass.
+  void AuraCollision(std::map<RegionId, Frame>* leaving) {
+    absl::flat_hash_map<BodyId, int> node_of = EdgeBodies();
+    if (node_of.empty()) return;
+    std::vector<Node> nodes;
+    for (const auto& [owner, graph] : graph_) {
+      for (size_t i = 0; i < graph.fragments.size(); ++i) {
+        bool linked = false;
+        for (BodyId id : graph.fragments[i].known) {
+          auto it = node_of.find(id);
+          if (it == node_of.end()) continue;
+          it->second = static_cast<int>(nodes.size());
+          linked = true;
+        }
+        if (linked) nodes.push_back({owner, static_cast<int>(i)});
+      }
+    }
+    UnionFind sets(static_cast<int>(nodes.size()));
+    for (const auto& [owner, graph] : graph_) {
+      for (const Edge& e : graph.edges) {
+        const int a = node_of.at(e.a), b = node_of.at(e.b);
+        AUREOLE_CHECK(a >= 0 && b >= 0, "no fragment holds body %llu of the edge that region %d saw",
+                      static_cast<unsigned long long>(a < 0 ? e.a : e.b), owner);
+        sets.Unite(a, b);
+      }
+    }
+    std::map<int, std::vector<int>> clusters;  // by representative; nodes ascend by (owner, fragment)
+    for (int i = 0; i < sets.size(); ++i) clusters[sets.Find(i)].push_back(i);
+    for (const auto& [representative, members] : clusters) MoveCluster(nodes, members, leaving);
+  }
+
+  void MoveCluster(const std::vector<Node>& nodes, const std::vector<int>& members,
+                   std::map<RegionId, Frame>* leaving) {
+    std::vector<std::pair<RegionId, double>> mass;
+    std::set<RegionId> owners;
+    int64_t bodies = 0;
+    for (int i : members) {
+      const Fragment& f = graph_.at(nodes[i].owner).fragments[nodes[i].index];
+      owners.insert(nodes[i].owner);
+      bodies += f.bodies;
+      for (const auto& [home, kg] : f.mass_by_home) AddMass(&mass, home, kg);
+    }
+    h_.stats.largest_component = std::max(h_.stats.largest_component, bodies);
+    h_.stats.longest_chain = std::max(h_.stats.longest_chain, static_cast<int64_t>(owners.size()));
+    const RegionId target = Heaviest(h_.world.layout, mass);
+    std::vector<BodyId> ids;
+    for (int i : members) {
+      if (nodes[i].owner == target) continue;
+      if (target == h_.self) senders_.insert(nodes[i].owner);
+      if (nodes[i].owner != h_.self) continue;
+      const std::vector<BodyId>& more = components_[nodes[i].index].members;
+      ids.insert(ids.end(), more.begin(), more.end());
+    }
+    if (!ids.empty()) Send(std::move(ids), target, TransferCause::kAuraCollision, leaving);
+  }
+
+  // Returns that were announced with the graph hold unless the component has an edge.
+  void GiveBackIslands(std::map<RegionId, Frame>* leaving) {
+    const absl::flat_hash_map<BodyId, int> linked = EdgeBodies();
+    for (const auto& [owner, graph] : graph_) {
+      for (size_t i = 0; i < graph.fragments.size(); ++i) {
+        const Fragment& f = graph.fragments[i];
+        if (f.gives_back == kNoRegion) continue;
+        if (std::any_of(f.known.begin(), f.known.end(), [&linked](BodyId id) { return linked.contains(id); })) continue;
+        if (f.gives_back == h_.self) senders_.insert(owner);
+        if (owner == h_.self) {
+          Send(components_[i].members, f.gives_back, TransferCause::kBoundaryTraverse, leaving);
+        }
+      }
+    }
+  }
+
+  void Send(std::vector<BodyId> ids, RegionId to, TransferCause cause, std::map<RegionId, Frame>* leaving) {
+    std::sort(ids.begin(), ids.end());
+    Transfer t = h_.Depart(std::move(ids), to, cause);
+    t.state = h_.engine->Extract(t.ids);
+    auto it = leaving->find(to);
+    if (it == leaving->end()) it = leaving->emplace(to, MakeFrame(to, 2)).first;
+    it->second.transfers.push_back(std::move(t));
+  }
+
+  void TakeArrivals() {
+    for (RegionId peer : senders_) {
+      const Frame f = h_.inboxes.at(peer).Pop();
+      for (const Transfer& t : f.transfers) h_.Arrive(t, peer, now());
+    }
+    senders_.clear();
+    phase_ = Phase::kStep;
+  }
+
+  Holdings& h_;
+  Phase phase_ = Phase::kBegin;
+  std::vector<Input> inputs_;
+  std::vector<BodyId> near_;                         // own bodies whose box may touch another region
+  std::vector<BodyId> told_ids_;                     // of these, told to anybody; ascending
+  absl::flat_hash_map<RegionId, Told> told_, next_;  // what each peer holds of us; what it must hold
+  absl::flat_hash_map<RegionId, absl::flat_hash_map<BodyId, Box>> remote_;  // what each peer has told
+  std::vector<Foreign> foreign_;                                            // all of that, by min.x
+  std::vector<Component> components_;                                       // parallel to graph_[self].fragments
+  std::map<RegionId, Frame> graph_;                                         // round 1 of this tick, own included
+  std::set<RegionId> senders_;                                              // who sends a transfer in this tick
+};
+
+}  // namespace
+
+std::unique_ptr<Protocol> MakeSyncExchange(Holdings& holdings) { return std::make_unique<SyncExchange>(holdings); }
+
+}  // namespace aureole

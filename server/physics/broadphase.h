@@ -1,0 +1,60 @@
+// Which bodies are close: two trees of fat boxes, and the pairs whose fat boxes overlap. A body that stays inside its
+// fat box, or does not move, costs nothing.
+#pragma once
+
+#include <BulletCollision/BroadphaseCollision/btDbvt.h>
+
+#include <deque>
+#include <functional>
+#include <vector>
+
+#include "server/physics/body.h"
+
+namespace aureole::physics {
+
+class Broadphase {
+ public:
+  // `release` frees what a pair holds before the pair goes.
+  explicit Broadphase(std::function<void(Pair&)> release) : release_(std::move(release)) {}
+
+  // Adds the body with its exact box, and its pairs.
+  void Insert(Body* body);
+  // Removes the body and its pairs.
+  void Remove(Body* body);
+  // The body's exact box has changed; `motion` (m) is how far it is likely to go soon.
+  void Update(Body* body, const btVector3& motion);
+  // Keeps the trees shallow; once a tick.
+  void Rebalance();
+
+  // Calls fn(Body*) for every dynamic body whose exact box meets the box, in no particular order.
+  template <class Fn>
+  void Query(const btVector3& low, const btVector3& high, Fn&& fn) const {
+    struct Hits : btDbvt::ICollide {
+      Hits(const btVector3& l, const btVector3& h, Fn& f) : low(l), high(h), call(f) {}
+      void Process(const btDbvtNode* leaf) override {
+        Body* b = static_cast<Body*>(leaf->data);
+        if (b->low.x() <= high.x() && low.x() <= b->high.x() && b->low.y() <= high.y() && low.y() <= b->high.y() &&
+            b->low.z() <= high.z() && low.z() <= b->high.z()) {
+          call(b);
+        }
+      }
+      const btVector3 &low, &high;
+      Fn& call;
+    } hits(low, high, fn);
+    moving_.collideTV(moving_.m_root, btDbvtVolume::FromMM(low, high), hits);
+  }
+
+ private:
+  void FindPairs(Body* body);
+  void AddPair(Body* x, Body* y);
+  void RemovePair(Pair* pair);
+
+  std::function<void(Pair&)> release_;
+  mutable btDbvt moving_;  // dynamic bodies
+  btDbvt fixed_;           // static and kinematic ones
+  std::deque<Pair> pool_;
+  std::vector<Pair*> free_;
+  std::vector<Body*> close_;
+};
+
+}  // namespace aureole::physics

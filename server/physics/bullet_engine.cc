@@ -1,0 +1,176 @@
+#include "server/physics/bullet_engine.h"
+
+#include <algorithm>
+#include <bit>
+#include <utility>
+
+#include "server/core/check.h"
+#include "server/physics/bullet_world.h"
+#include "server/physics/state.h"
+
+namespace aureole {
+namespace physics {
+namespace {
+
+constexpr int kPool = 4096;        // manifolds of a region
+constexpr int kScratchPool = 128;  // of a cluster on its own
+
+class BulletEngine : public Engine {
+ public:
+  BulletEngine(std::shared_ptr<Surroundings> surroundings, int pool) : world_(std::move(surroundings), pool) {}
+
+  void Spawn(const BodySpec& body) override { world_.Add(world_.StateOf(body)); }
+  void Join(const JointSpec& joint) override { world_.AddJoint(joint); }
+  void Apply(const Input& input) override;
+  void Step(Tick n) override { world_.Step(n); }
+
+  bool Contains(BodyId id) const override { return world_.Find(id) != nullptr; }
+  BodyView View(BodyId id) const override;
+  BodyPose Pose(BodyId id) const override;
+  uint64_t Hash(BodyId id) const override;
+  void Jointed(BodyId id, std::vector<BodyId>* out) const override;
+
+  std::vector<BodyId> Ids() const override;
+  void CollectOutside(const Rect& interior, double margin, std::vector<BodyId>* out) const override;
+  void Query(const Box& box, std::vector<BodyId>* out) const override;
+  double MaxRadius() const override { return world_.max_radius(); }
+
+  std::string Save(std::span<const BodyId> ids) const override;
+  std::string Extract(std::span<const BodyId> ids) override;
+  absl::Status Restore(std::string_view state) override { return RestoreState(state, &world_); }
+  std::unique_ptr<Engine> Scratch() const override {
+    return std::make_unique<BulletEngine>(world_.surroundings(), kScratchPool);
+  }
+
+  EngineCounts Counts() const override {
+    return {static_cast<int64_t>(world_.bodies().size()), static_cast<int64_t>(world_.awake().size()),
+            world_.contacts().CountPoints()};
+  }
+
+ private:
+  Body* Get(BodyId id) const;
+
+  BulletWorld world_;
+};
+
+Body* BulletEngine::Get(BodyId id) const {
+  Body* body = world_.Find(id);
+  AUREOLE_CHECK(body != nullptr, "body %llu is not here", static_cast<unsigned long long>(id));
+  return body;
+}
+
+void BulletEngine::Apply(const Input& input) {
+  if (input.kind == Input::Kind::kSpawn) {
+    Spawn(*input.spawn);
+    return;
+  }
+  Body* body = Get(input.body);
+  const btVector3 linear = ToBullet(input.linear), angular = ToBullet(input.angular);
+  switch (input.kind) {
+    case Input::Kind::kRemove:
+      world_.WakeNeighbours(body);
+      world_.Remove(body);
+      break;
+    case Input::Kind::kImpulse:
+      world_.SetVelocities(body, body->rigid.getLinearVelocity() + linear * body->rigid.getInvMass(),
+                           body->rigid.getAngularVelocity() + body->rigid.getInvInertiaTensorWorld() * angular);
+      break;
+    default:
+      world_.SetVelocities(body, linear, angular);
+  }
+}
+
+BodyView BulletEngine::View(BodyId id) const {
+  const Body& body = *Get(id);
+  BodyView view;
+  view.id = id;
+  view.box = {FromBullet(body.low), FromBullet(body.high)};
+  view.centre = FromBullet(body.rigid.getWorldTransform().getOrigin());
+  view.radius = world_.Radius(body);
+  view.velocity = FromBullet(body.rigid.getLinearVelocity());
+  view.mass = body.mass;
+  view.asleep = body.asleep;
+  return view;
+}
+
+BodyPose BulletEngine::Pose(BodyId id) const {
+  const Body& body = *Get(id);
+  const btTransform& at = body.rigid.getWorldTransform();
+  const btQuaternion turn = at.getRotation();
+  return {FromBullet(at.getOrigin()), Quat(turn.w(), turn.x(), turn.y(), turn.z()),
+          FromBullet(body.rigid.getLinearVelocity()), body.asleep, body.shape->source};
+}
+
+uint64_t BulletEngine::Hash(BodyId id) const {
+  const Body& body = *Get(id);
+  uint64_t hash = id;
+  const auto mix = [&hash](uint64_t word) {
+    hash = (hash ^ word) * 0x9fb21c651e98df25;
+    hash ^= hash >> 32;
+  };
+  const auto mix_vector = [&mix](const btVector3& v) {
+    for (int i = 0; i < 3; ++i) mix(std::bit_cast<uint64_t>(v[i]));
+  };
+  for (int i = 0; i < 3; ++i) mix_vector(body.rigid.getWorldTransform().getBasis()[i]);
+  mix_vector(body.rigid.getWorldTransform().getOrigin());
+  mix_vector(body.rigid.getLinearVelocity());
+  mix_vector(body.rigid.getAngularVelocity());
+  mix(body.still * uint64_t{2} + (body.asleep ? 1 : 0));
+  return hash;
+}
+
+void BulletEngine::Jointed(BodyId id, std::vector<BodyId>* out) const {
+  const Body* body = Get(id);
+  const auto first = static_cast<std::ptrdiff_t>(out->size());
+  for (const Joint* j : body->joints) {
+    if (const Body* other = j->Other(body)) out->push_back(other->id);
+  }
+  std::sort(out->begin() + first, out->end());
+  out->erase(std::unique(out->begin() + first, out->end()), out->end());
+}
+
+std::vector<BodyId> BulletEngine::Ids() const {
+  std::vector<BodyId> ids;
+  ids.reserve(world_.bodies().size());
+  for (const auto& [id, body] : world_.bodies()) ids.push_back(id);
+  std::sort(ids.begin(), ids.end());
+  return ids;
+}
+
+void BulletEngine::CollectOutside(const Rect& interior, double margin, std::vector<BodyId>* out) const {
+  const auto first = static_cast<std::ptrdiff_t>(out->size());
+  for (const Body* b : world_.SleepersOutside(interior, margin)) out->push_back(b->id);
+  for (const Body* b : world_.awake()) {
+    if (!interior.Encloses({FromBullet(b->low), FromBullet(b->high)}, margin)) out->push_back(b->id);
+  }
+  std::sort(out->begin() + first, out->end());
+}
+
+void BulletEngine::Query(const Box& box, std::vector<BodyId>* out) const {
+  const auto first = static_cast<std::ptrdiff_t>(out->size());
+  world_.broadphase().Query(ToBullet(box.min), ToBullet(box.max), [out](const Body* b) { out->push_back(b->id); });
+  std::sort(out->begin() + first, out->end());
+}
+
+std::string BulletEngine::Save(std::span<const BodyId> ids) const {
+  for (BodyId id : ids) Get(id);
+  return SaveState(world_, ids);
+}
+
+std::string BulletEngine::Extract(std::span<const BodyId> ids) {
+  std::string state = Save(ids);
+  for (BodyId id : ids) world_.Remove(world_.Find(id));
+  return state;
+}
+
+}  // namespace
+
+std::unique_ptr<Engine> MakeEngine(const Environment& environment) {
+  return std::make_unique<BulletEngine>(std::make_shared<Surroundings>(environment), kPool);
+}
+
+}  // namespace physics
+
+std::unique_ptr<Engine> MakeBulletEngine(const Environment& environment) { return physics::MakeEngine(environment); }
+
+}  // namespace aureole

@@ -1,0 +1,111 @@
+#include "server/region/control_stream.h"
+
+#include <chrono>
+#include <utility>
+
+#include <grpcpp/create_channel.h>
+#include <grpcpp/security/credentials.h>
+
+namespace aureole {
+
+void EventQueue::Push(Event event) {
+  {
+    const std::lock_guard lock(mutex_);
+    events_.push_back(std::move(event));
+  }
+  pushed_.notify_one();
+}
+
+Event EventQueue::Pop() {
+  std::unique_lock lock(mutex_);
+  pushed_.wait(lock, [this] { return !events_.empty(); });
+  Event event = std::move(events_.front());
+  events_.pop_front();
+  return event;
+}
+
+ControlStream::ControlStream(const std::string& address, v1::Hello hello, EventQueue* events) : events_(events) {
+  grpc::ChannelArguments arguments;
+  arguments.SetInt(GRPC_ARG_ENABLE_HTTP_PROXY, 0);
+  stub_ = v1::Control::NewStub(grpc::CreateCustomChannel(address, grpc::InsecureChannelCredentials(), arguments));
+  stub_->async()->Join(&context_, this);
+  AddHold();  // writes come from outside of gRPC's callbacks; released when nothing is read any more
+  StartRead(&in_);
+  v1::FromRegion first;
+  *first.mutable_hello() = std::move(hello);
+  Send(std::move(first));
+  StartCall();
+}
+
+ControlStream::~ControlStream() {
+  context_.TryCancel();
+  std::unique_lock lock(mutex_);
+  done_changed_.wait(lock, [this] { return done_; });
+}
+
+void ControlStream::Send(v1::FromRegion message) {
+  const std::lock_guard lock(mutex_);
+  if (ended_ || closing_) return;
+  queue_.push_back(std::move(message));
+  Pump();
+}
+
+void ControlStream::Close(const std::string& reason) {
+  std::unique_lock lock(mutex_);
+  if (!closing_) {
+    closing_ = true;
+    queue_.emplace_back().mutable_goodbye()->set_reason(reason);
+    Pump();
+  }
+  done_changed_.wait_for(lock, std::chrono::seconds(1), [this] { return done_; });
+}
+
+// Holds the mutex.
+void ControlStream::Pump() {
+  if (ended_ || writing_) return;
+  if (queue_.empty()) {
+    if (closing_) {
+      ended_ = true;
+      StartWritesDone();
+    }
+    return;
+  }
+  out_ = std::move(queue_.front());
+  queue_.pop_front();
+  writing_ = true;
+  StartWrite(&out_);
+}
+
+void ControlStream::OnReadDone(bool ok) {
+  if (ok) {
+    Event event;
+    event.message = std::move(in_);
+    events_->Push(std::move(event));
+    in_.Clear();
+    StartRead(&in_);
+    return;
+  }
+  {
+    const std::lock_guard lock(mutex_);
+    ended_ = true;
+  }
+  RemoveHold();
+}
+
+void ControlStream::OnWriteDone(bool ok) {
+  const std::lock_guard lock(mutex_);
+  writing_ = false;
+  if (ok) Pump();
+}
+
+void ControlStream::OnDone(const grpc::Status& status) {
+  Event event;
+  event.kind = Event::Kind::kControlLost;
+  event.reason = status.ok() ? "the control plane has ended the stream" : status.error_message();
+  events_->Push(std::move(event));
+  const std::lock_guard lock(mutex_);
+  done_ = true;
+  done_changed_.notify_all();
+}
+
+}  // namespace aureole

@@ -1,0 +1,69 @@
+// The region server's side of the control stream (control.proto), and the one queue of events that the server's main
+// thread waits on.
+#pragma once
+
+#include <condition_variable>
+#include <deque>
+#include <memory>
+#include <mutex>
+#include <string>
+
+#include <grpcpp/client_context.h>
+
+#include "aureole/v1/control.grpc.pb.h"
+
+namespace aureole {
+
+struct Event {
+  enum class Kind { kMessage, kControlLost, kSignal };
+  Kind kind = Kind::kMessage;
+  v1::ToRegion message;
+  std::string reason;  // why the stream ended
+  int signal = 0;
+};
+
+// Unbounded, but fed by people and a control plane only. Thread-safe.
+class EventQueue {
+ public:
+  void Push(Event event);
+  // Waits for the next.
+  Event Pop();
+
+ private:
+  std::mutex mutex_;
+  std::condition_variable pushed_;
+  std::deque<Event> events_;
+};
+
+// One Join stream. Messages and the end of the stream become events.
+class ControlStream final : public grpc::ClientBidiReactor<v1::FromRegion, v1::ToRegion> {
+ public:
+  // Starts to connect and says `hello`.
+  ControlStream(const std::string& address, v1::Hello hello, EventQueue* events);
+  // Cancels what is left and waits for the end.
+  ~ControlStream() override;
+
+  // Any thread; never waits for the network. Dropped when the stream has ended.
+  void Send(v1::FromRegion message);
+  // Says goodbye after everything that was sent, and waits for the end of the stream, at most a second.
+  void Close(const std::string& reason);
+
+ private:
+  void OnReadDone(bool ok) override;
+  void OnWriteDone(bool ok) override;
+  void OnDone(const grpc::Status& status) override;
+  void Pump();
+
+  EventQueue* const events_;
+  std::unique_ptr<v1::Control::Stub> stub_;
+  grpc::ClientContext context_;
+  v1::ToRegion in_;  // only touched by reads
+
+  std::mutex mutex_;
+  std::condition_variable done_changed_;
+  std::deque<v1::FromRegion> queue_;
+  v1::FromRegion out_;  // in flight
+  bool writing_ = false, ended_ = false, closing_ = false, done_ = false;
+};
+
+}  // namespace aureole

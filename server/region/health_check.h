@@ -1,0 +1,13 @@
+// Asks a server's standard health service (grpc.health.v1), for probes that have no client of their own.
+#pragma once
+
+#include <string>
+
+#include <absl/status/status.h>
+
+namespace aureole {
+
+// OK when `address` (host:port) says SERVING within two seconds; else Unavailable with what it said.
+absl::Status CheckHealth(const std::string& address);
+
+}  // namespace aureole

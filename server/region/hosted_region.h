@@ -1,0 +1,48 @@
+// One assignment being served: the world, the region, its links and its tick thread.
+#pragma once
+
+#include <memory>
+#include <string>
+#include <thread>
+
+#include <absl/status/statusor.h>
+
+#include "aureole/v1/control.pb.h"
+#include "server/core/region.h"
+#include "server/core/world.h"
+#include "server/region/region_links.h"
+#include "server/region/tick_loop.h"
+
+namespace aureole {
+
+class HostedRegion {
+ public:
+  // Loads the world and the region's share of it. InvalidArgument when the assignment makes no sense.
+  static absl::StatusOr<std::unique_ptr<HostedRegion>> Load(const v1::Assignment& assignment);
+  // Stops and joins the tick thread, and closes the links.
+  ~HostedRegion();
+
+  const World& world() const { return world_; }
+  const Region& region() const { return *region_; }
+  RegionLinks& links() { return *links_; }
+  const v1::Assignment& assignment() const { return assignment_; }
+
+  // Accepts and dials the peers.
+  void Connect(PeerService* service);
+  // Starts the tick thread. Once.
+  void Start(int64_t start_unix_us, TickLoop::Hooks hooks);
+  // Ends the tick thread. Idempotent.
+  void Stop();
+
+ private:
+  HostedRegion(const v1::Assignment& assignment, World world);
+
+  const v1::Assignment assignment_;
+  const World world_;
+  std::unique_ptr<Region> region_;
+  std::unique_ptr<RegionLinks> links_;
+  std::unique_ptr<TickLoop> loop_;
+  std::thread thread_;
+};
+
+}  // namespace aureole

@@ -1,0 +1,55 @@
+// aureole-region: one region server.
+
+#include <signal.h>
+#include <sys/prctl.h>
+#include <unistd.h>
+
+#include <iostream>
+#include <string>
+
+#include <spdlog/sinks/stdout_sinks.h>
+#include <spdlog/spdlog.h>
+#include <CLI/CLI.hpp>
+
+#include "server/region/health_check.h"
+#include "server/region/region_server.h"
+
+int main(int argc, char** argv) {
+  CLI::App app("One region server of an Aureole world. It joins the control plane, which tells it what to simulate.");
+  app.set_version_flag("--version", AUREOLE_VERSION);
+  app.footer("Exit codes: 0 ended in order, or healthy; 1 could not start or join, or not healthy; 2 bad flags.");
+  aureole::RegionServerOptions options;
+  std::string health_check, log_level = "info";
+  bool exit_with_parent = false;
+  app.add_option("--control", options.control, "host:port of the control plane");
+  app.add_option("--token", options.token, "says which region this process was started for");
+  app.add_option("--listen", options.listen, "host:port for peers and clients; port 0 is any")->capture_default_str();
+  app.add_option("--metrics", options.metrics, "host:port of Prometheus /metrics, or off")->capture_default_str();
+  app.add_option("--log-level", log_level, "on standard error")
+      ->check(CLI::IsMember({"debug", "info", "warn", "error", "off"}))
+      ->capture_default_str();
+  app.add_flag("--exit-with-parent", exit_with_parent, "end in order when the parent process dies");
+  app.add_option("--health-check", health_check, "only ask the server at host:port whether it is serving");
+  try {
+    app.parse(argc, argv);
+    if (health_check.empty() && options.control.empty()) throw CLI::RequiredError("--control");
+  } catch (const CLI::ParseError& e) {
+    return app.exit(e) == 0 ? 0 : 2;
+  }
+  if (!health_check.empty()) {
+    const absl::Status s = aureole::CheckHealth(health_check);
+    std::cerr << (s.ok() ? "serving" : std::string(s.message())) << "\n";
+    return s.ok() ? 0 : 1;
+  }
+
+  aureole::BlockSignals();
+  if (exit_with_parent) {
+    const pid_t parent = getppid();
+    prctl(PR_SET_PDEATHSIG, SIGTERM);
+    if (getppid() != parent) return 0;  // it has died already
+  }
+  spdlog::set_default_logger(spdlog::stderr_logger_mt("aureole-region"));
+  spdlog::set_pattern("%Y-%m-%dT%H:%M:%S.%eZ %l %v", spdlog::pattern_time_type::utc);
+  spdlog::set_level(spdlog::level::from_str(log_level));
+  return aureole::RunRegionServer(options);
+}

@@ -1,0 +1,102 @@
+#include "server/region/region_links.h"
+
+#include <algorithm>
+
+#include "server/transport/frame_codec.h"
+
+namespace aureole {
+
+RegionLinks::RegionLinks(const LinkIdentity& identity, const std::vector<RegionId>& peers,
+                         std::function<void(RegionId, const std::string&)> log)
+    : identity_(identity) {
+  const auto deliver = [this](Frame frame) {
+    {
+      const std::lock_guard lock(mutex_);
+      mailbox_.push_back(std::move(frame));
+    }
+    arrived_.notify_one();
+  };
+  for (RegionId peer : peers)
+    links_.push_back(std::make_unique<PeerLink>(PeerLink::Options{identity, peer, deliver, log}));
+}
+
+RegionLinks::~RegionLinks() { Close(); }
+
+void RegionLinks::Connect(PeerService* service, const std::vector<std::string>& endpoints) {
+  service_ = service;
+  std::vector<PeerLink*> dialled_by_peer;
+  for (const auto& link : links_) {
+    if (link->peer() < identity_.self) dialled_by_peer.push_back(link.get());
+  }
+  service->Serve(identity_, dialled_by_peer);
+  for (const auto& link : links_) {
+    if (link->peer() > identity_.self) link->Dial(endpoints.at(link->peer()));
+  }
+}
+
+void RegionLinks::Send(const std::vector<Frame>& frames) {
+  for (const Frame& frame : frames) {
+    const auto bytes = std::make_shared<const std::string>(EncodeFrame(frame));
+    for (const auto& link : links_) {
+      if (frame.to == kEveryone || frame.to == link->peer()) link->Send(bytes);
+    }
+  }
+}
+
+void RegionLinks::Receive(Clock::time_point deadline, std::vector<Frame>* out) {
+  out->clear();
+  std::unique_lock lock(mutex_);
+  if (mailbox_.empty()) arrived_.wait_until(lock, deadline, [this] { return interrupted_ || !mailbox_.empty(); });
+  out->swap(mailbox_);
+}
+
+void RegionLinks::Interrupt() {
+  {
+    const std::lock_guard lock(mutex_);
+    interrupted_ = true;
+  }
+  arrived_.notify_all();
+}
+
+void RegionLinks::Cut(RegionId peer) {
+  for (const auto& link : links_) {
+    if (link->peer() == peer) link->Cut();
+  }
+}
+
+void RegionLinks::CutAll() {
+  for (const auto& link : links_) link->Cut();
+}
+
+bool RegionLinks::Drain(std::chrono::milliseconds at_most) {
+  const auto deadline = Clock::now() + at_most;
+  bool all = true;
+  for (const auto& link : links_) {
+    const auto left = std::chrono::duration_cast<std::chrono::milliseconds>(deadline - Clock::now());
+    all &= link->AwaitWritten(std::max(left, std::chrono::milliseconds(0)));
+  }
+  return all;
+}
+
+void RegionLinks::Close() {
+  if (service_ != nullptr) service_->Stop();
+  for (const auto& link : links_) link->Close();
+}
+
+LinkStats RegionLinks::Totals() const {
+  LinkStats sum;
+  for (const auto& link : links_) {
+    const LinkStats s = link->stats();
+    sum.frames_sent += s.frames_sent;
+    sum.frames_received += s.frames_received;
+    sum.bytes_sent += s.bytes_sent;
+    sum.connections += s.connections;
+    sum.reconnects += s.reconnects;
+    sum.refused_hellos += s.refused_hellos;
+    sum.refused_frames += s.refused_frames;
+    sum.duplicates += s.duplicates;
+  }
+  return sum;
+}
+
+}  // namespace aureole

@@ -1,0 +1,24 @@
+// The region server process: joins the control plane, simulates the region that it is given, and leaves in order.
+#pragma once
+
+#include <string>
+
+namespace aureole {
+
+struct RegionServerOptions {
+  std::string control;                  // host:port of the control plane
+  std::string token;                    // says which region this process was started for
+  std::string listen = "127.0.0.1:0";   // for peers and clients
+  std::string metrics = "127.0.0.1:0";  // Prometheus over HTTP; "off"
+};
+
+// Blocks SIGTERM, SIGINT and SIGUSR1 in the calling thread and all that it starts: RunRegionServer takes them. Call it
+// before the first thread.
+void BlockSignals();
+
+// Serves until the control plane says Stop or goes away, or SIGTERM or SIGINT. SIGUSR1 cuts every link's connection
+// once, for tests of the resumption. Returns the exit code: 0, or 1 when it could not listen, join or load the world,
+// which is logged.
+int RunRegionServer(const RegionServerOptions& options);
+
+}  // namespace aureole

@@ -1,0 +1,214 @@
+#include "server/region/tick_loop.h"
+
+#include <algorithm>
+#include <ctime>
+
+#include <absl/strings/str_cat.h>
+#include <absl/strings/str_join.h>
+
+namespace aureole {
+namespace {
+
+using std::chrono::microseconds;
+using std::chrono::milliseconds;
+
+constexpr milliseconds kReportEvery(200);
+constexpr milliseconds kWaitIsWorthTelling(100);  // in reports
+constexpr milliseconds kWaitIsWorthLogging(1000);
+constexpr milliseconds kLongestSleep(100);  // so that Stop is heard
+
+double Ms(std::chrono::steady_clock::duration d) { return std::chrono::duration<double, std::milli>(d).count(); }
+
+void SleepUntil(std::chrono::steady_clock::time_point t) {
+  const auto ns = std::chrono::duration_cast<std::chrono::nanoseconds>(t.time_since_epoch()).count();
+  const timespec when{static_cast<time_t>(ns / 1'000'000'000), static_cast<long>(ns % 1'000'000'000)};
+  while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &when, nullptr) == EINTR) {
+  }
+}
+
+}  // namespace
+
+TickLoop::TickLoop(const World& world, Region* region, RegionLinks* links, Options options, Hooks hooks)
+    : world_(world),
+      region_(region),
+      links_(links),
+      options_(options),
+      hooks_(std::move(hooks)),
+      windows_(world.environment.tick_us) {}
+
+void TickLoop::Stop() {
+  stopped_ = true;
+  links_->Interrupt();
+}
+
+bool TickLoop::Run() {
+  const microseconds until_start(
+      options_.start_unix_us -
+      std::chrono::duration_cast<microseconds>(std::chrono::system_clock::now().time_since_epoch()).count());
+  start_ = Clock::now() + until_start;
+  reported_at_ = Clock::now();
+  reported_tick_ = region_->tick();
+  const auto done = [this] { return options_.last_tick > 0 && region_->tick() >= options_.last_tick; };
+  while (!done() && SleepUntilDue(region_->tick() + 1)) {
+    EndLap();
+    if (!RunTick()) break;
+    AfterTick();
+    if (Clock::now() - reported_at_ >= kReportEvery || pending_.windows_size() > 0) Report({}, false);
+  }
+  EndLap();
+  Report({}, done());
+  return done();
+}
+
+bool TickLoop::SleepUntilDue(Tick n) {
+  if (!options_.real_time) return !stopped_;
+  const Clock::time_point due = start_ + microseconds(n * world_.environment.tick_us);
+  const Clock::time_point since = Clock::now();
+  while (!stopped_ && Clock::now() < due) SleepUntil(std::min<Clock::time_point>(due, Clock::now() + kLongestSleep));
+  clock_.AddWait(Ms(Clock::now() - since));
+  return !stopped_;
+}
+
+bool TickLoop::RunTick() {
+  const Tick n = region_->tick() + 1;
+  while (region_->tick() < n) {
+    if (!AwaitPeers()) return false;
+    out_.clear();
+    region_->Advance(&out_);
+    links_->Send(out_);
+  }
+  lap_of_ = n;
+  return true;
+}
+
+// Until the region can go on; false when stopped. Reports go out meanwhile, and say for whom it waits.
+bool TickLoop::AwaitPeers() {
+  if (!region_->Ready()) Take(Clock::time_point::min());
+  if (region_->Ready()) return !stopped_;
+  ++waits_;
+  const Clock::time_point since = Clock::now();
+  bool logged = false;
+  while (!region_->Ready() && !stopped_) {
+    Take(Clock::now() + kWaitIsWorthTelling);
+    const Clock::time_point now = Clock::now();
+    if (region_->Ready() || now - since < kWaitIsWorthTelling) continue;
+    std::vector<RegionId> missing;
+    region_->Missing(&missing);
+    if (now - reported_at_ >= kReportEvery) Report(missing, false);
+    if (!logged && now - since >= kWaitIsWorthLogging) {
+      logged = true;
+      hooks_.log(absl::StrCat("tick ", region_->tick() + 1, " waits for region ", absl::StrJoin(missing, ", ")));
+    }
+  }
+  const Clock::duration wait = Clock::now() - since;
+  if (logged && !stopped_) {
+    hooks_.log(
+        absl::StrCat("tick ", region_->tick() + 1, " goes on after a wait of ", static_cast<int64_t>(Ms(wait)), " ms"));
+  }
+  waited_ += wait;
+  clock_.AddWait(Ms(wait));
+  return !stopped_;
+}
+
+void TickLoop::Take(Clock::time_point deadline) {
+  links_->Receive(deadline, &in_);
+  for (Frame& frame : in_) {
+    const RegionId from = frame.from;
+    const Tick tick = frame.tick;
+    if (absl::Status s = region_->Receive(std::move(frame)); !s.ok()) {
+      // Decoded, but not one of the protocol's: the peer is broken. Nothing has changed here; the run waits for it.
+      ++refused_;
+      hooks_.log(absl::StrCat("frame of tick ", tick, " from region ", from, " refused: ", std::string(s.message())));
+      links_->Cut(from);
+    }
+  }
+}
+
+void TickLoop::EndLap() {
+  const FrameSample sample = clock_.Lap();
+  if (lap_of_ == 0) return;
+  windows_.Add(sample);
+  frames_since_report_.push_back(sample.process_cpu);
+  hooks_.after_tick(sample);
+  if (windows_.EndsAt(lap_of_) || lap_of_ == options_.last_tick) {
+    v1::Window* window = pending_.add_windows();
+    *window = windows_.Take(lap_of_);
+    const EngineCounts counts = region_->engine().Counts();
+    window->set_bodies(counts.bodies);
+    window->set_awake(counts.awake);
+    window->set_contacts(counts.contacts);
+  }
+  lap_of_ = 0;
+}
+
+void TickLoop::AfterTick() {
+  const Tick n = region_->tick();
+  const int64_t bodies = region_->engine().Counts().bodies;
+  body_ticks_ += bodies;
+  away_body_ticks_ += region_->stats().away_bodies;
+  if ((options_.hash_every > 0 && n % options_.hash_every == 0) || n == options_.last_tick) {
+    v1::TickHash* hash = pending_.add_hashes();
+    hash->set_tick(n);
+    hash->set_hash(region_->StateHash());
+    std::vector<BodyRecord> records;  // those in flight included
+    region_->Observe(&records);
+    hash->set_bodies(static_cast<int64_t>(records.size()));
+  }
+  for (const Violation& v : region_->TakeViolations()) {
+    hooks_.log(absl::StrCat("violation at tick ", v.tick, ": body ", v.own, " of this region and body ", v.foreign,
+                            " were stepped apart although they touch, ", v.depth, " m deep at ", v.speed, " m/s"));
+    v1::Violation* out = pending_.add_violation_log();
+    out->set_tick(v.tick);
+    out->set_own(v.own);
+    out->set_foreign(v.foreign);
+    out->set_depth(v.depth);
+    out->set_speed(v.speed);
+  }
+  hooks_.publish(*region_, bodies);
+}
+
+void TickLoop::Report(const std::vector<RegionId>& waiting_for, bool finished) {
+  const Clock::time_point now = Clock::now();
+  v1::Report& r = pending_;
+  const RegionStats& stats = region_->stats();
+  const EngineCounts counts = region_->engine().Counts();
+  const LinkStats links = links_->Totals();
+  const double wall_us = 1e3 * Ms(now - reported_at_);
+  const auto simulated_us = static_cast<double>((region_->tick() - reported_tick_) * world_.environment.tick_us);
+  r.set_tick(region_->tick());
+  r.set_bodies(counts.bodies);
+  r.set_awake(counts.awake);
+  r.set_real_time_factor(wall_us > 0 ? simulated_us / wall_us : 0);
+  *r.mutable_frame() = Summarise(&frames_since_report_);
+  r.set_auras_told(stats.auras_told);
+  r.set_aura_updates(stats.auras_sent);
+  r.set_aura_tests(stats.aura_tests);
+  r.set_transfers(stats.transfers_out);
+  r.set_touching_transfers(stats.touching_out);
+  r.set_bodies_moved(stats.bodies_out);
+  r.set_returns(stats.returns_out);
+  r.set_largest_cluster(stats.largest_cluster);
+  r.set_largest_component(stats.largest_component);
+  r.set_longest_chain(stats.longest_chain);
+  r.set_home_crossings(stats.home_crossings);
+  r.set_violations(stats.violations);
+  r.set_slack_min(stats.slack_min);
+  r.set_away_bodies(stats.away_bodies);
+  r.set_away_body_ticks(away_body_ticks_);
+  r.set_body_ticks(body_ticks_);
+  r.set_bytes_sent(links.bytes_sent);
+  r.set_frames_sent(links.frames_sent);
+  r.set_reconnects(links.reconnects);
+  r.set_refused_frames(links.refused_frames + refused_);
+  r.set_waits(waits_);
+  r.set_wait_us(std::chrono::duration_cast<microseconds>(waited_).count());
+  r.mutable_waiting_for()->Add(waiting_for.begin(), waiting_for.end());
+  r.set_finished(finished);
+  hooks_.report(r);
+  pending_.Clear();
+  frames_since_report_.clear();
+  reported_at_ = now;
+  reported_tick_ = region_->tick();
+}
+
+}  // namespace aureole

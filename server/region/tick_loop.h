@@ -1,0 +1,77 @@
+// The tick thread of a region server: paces the region by the wall clock, moves frames between it and the links, and
+// measures and reports what happens.
+#pragma once
+
+#include <atomic>
+#include <cstdint>
+#include <functional>
+#include <string>
+#include <vector>
+
+#include "aureole/v1/control.pb.h"
+#include "server/core/region.h"
+#include "server/region/frame_clock.h"
+#include "server/region/region_links.h"
+
+namespace aureole {
+
+class TickLoop {
+ public:
+  struct Options {
+    // Tick n begins no earlier than `start_unix_us` (wall time of tick 0) plus n tick lengths. Ticks that are late run
+    // at once; the simulation then runs slower than real time, which the reports' real_time_factor says.
+    bool real_time = true;
+    int64_t start_unix_us = 0;
+    Tick last_tick = 0;      // 0: runs until Stop
+    int64_t hash_every = 0;  // ticks; 0: only the last tick is hashed
+  };
+  // All called on the tick thread.
+  struct Hooks {
+    std::function<void(const FrameSample&)> after_tick;
+    std::function<void(const Region&, int64_t bodies)> publish;  // after each tick
+    std::function<void(const v1::Report&)> report;
+    std::function<void(const std::string&)> log;  // waits over 1 s, violations, refused frames
+  };
+
+  // All outlive the loop.
+  TickLoop(const World& world, Region* region, RegionLinks* links, Options options, Hooks hooks);
+
+  // Runs to the last tick or until Stop; then sends a last report. True when the last tick was reached.
+  bool Run();
+  // From any thread, also before Run; Run returns soon after.
+  void Stop();
+
+ private:
+  using Clock = RegionLinks::Clock;
+
+  bool SleepUntilDue(Tick n);
+  bool RunTick();
+  bool AwaitPeers();
+  void Take(Clock::time_point deadline);
+  void EndLap();
+  void AfterTick();
+  void Report(const std::vector<RegionId>& waiting_for, bool finished);
+
+  const World& world_;
+  Region* const region_;
+  RegionLinks* const links_;
+  const Options options_;
+  const Hooks hooks_;
+  std::atomic<bool> stopped_ = false;
+
+  FrameClock clock_;
+  WindowMeter windows_;
+  std::vector<Frame> in_, out_;
+  v1::Report pending_;  // hashes, windows and violations since the last report
+  std::vector<double> frames_since_report_;
+  Clock::time_point start_;  // of tick 0
+  Tick lap_of_ = 0;          // the tick whose lap runs; 0: none
+  Clock::time_point reported_at_;
+  Tick reported_tick_ = 0;
+  int64_t waits_ = 0;
+  Clock::duration waited_{};
+  int64_t refused_ = 0;
+  int64_t body_ticks_ = 0, away_body_ticks_ = 0;
+};
+
+}  // namespace aureole

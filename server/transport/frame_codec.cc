@@ -1,0 +1,344 @@
+#include "server/transport/frame_codec.h"
+
+#include <bit>
+#include <cmath>
+
+#include <absl/strings/str_cat.h>
+
+#include "aureole/v1/peer.pb.h"
+#include "server/core/check.h"
+#include "server/transport/link_limits.h"
+
+namespace aureole {
+namespace {
+
+using Ids = google::protobuf::RepeatedField<int64_t>;
+using Floats = google::protobuf::RepeatedField<float>;
+using Doubles = google::protobuf::RepeatedField<double>;
+
+// ---- encoding ----
+
+class IdWriter {
+ public:
+  explicit IdWriter(Ids* out) : out_(out) {}
+  void Add(uint64_t id) {
+    out_->Add(static_cast<int64_t>(id - last_));
+    last_ = id;
+  }
+
+ private:
+  Ids* out_;
+  uint64_t last_ = 0;
+};
+
+void AddBox(const WireBox& box, Floats* out) {
+  out->Add(std::begin(box.min), std::end(box.min));
+  out->Add(std::begin(box.max), std::end(box.max));
+}
+
+bool IsPositiveZero(float f) { return std::bit_cast<uint32_t>(f) == 0; }
+
+void EncodeAuras(const std::vector<Aura>& auras, v1::Frame* out) {
+  bool owners = false, velocities = false, speeds = false, sleepers = false;
+  for (const Aura& a : auras) {
+    owners |= a.owner != kNoRegion;
+    for (float v : a.velocity) velocities |= !IsPositiveZero(v);
+    speeds |= !IsPositiveZero(a.speed);
+    sleepers |= a.asleep;
+  }
+  IdWriter ids(out->mutable_aura_id());
+  out->mutable_aura_box()->Reserve(static_cast<int>(6 * auras.size()));
+  for (const Aura& a : auras) {
+    ids.Add(a.id);
+    AddBox(a.box, out->mutable_aura_box());
+    if (owners) out->add_aura_owner(static_cast<uint32_t>(a.owner + 1));
+    if (velocities) out->mutable_aura_velocity()->Add(std::begin(a.velocity), std::end(a.velocity));
+    if (speeds) out->add_aura_speed(a.speed);
+    if (sleepers) out->add_aura_asleep(a.asleep);
+  }
+}
+
+void EncodeFragment(const Fragment& f, v1::Frame::Fragment* out) {
+  IdWriter known(out->mutable_known());
+  for (BodyId id : f.known) known.Add(id);
+  out->set_id(f.id);
+  out->set_bodies(f.bodies);
+  for (const auto& [region, mass] : f.mass_by_home) {
+    out->add_home(static_cast<uint32_t>(region));
+    out->add_mass(mass);
+  }
+  out->set_gives_back(static_cast<uint32_t>(f.gives_back + 1));
+}
+
+void EncodeTransfer(const Transfer& t, v1::Frame::Transfer* out) {
+  AUREOLE_CHECK(t.ids.size() <= kMaxTransferBodies && t.pending.size() <= kMaxPending,
+                "cluster of body %llu: %zu bodies, %zu pending inputs",
+                static_cast<unsigned long long>(t.ids.empty() ? 0 : t.ids[0]), t.ids.size(), t.pending.size());
+  IdWriter ids(out->mutable_id());
+  for (BodyId id : t.ids) ids.Add(id);
+  out->mutable_epoch()->Add(t.epochs.begin(), t.epochs.end());
+  out->set_cause(static_cast<uint32_t>(t.cause));
+  out->set_state(t.state);
+  for (const Input& input : t.pending) {
+    AUREOLE_CHECK(input.kind != Input::Kind::kSpawn, "pending spawn in the transfer of body %llu",
+                  static_cast<unsigned long long>(input.body));
+    v1::Frame::Input* in = out->add_pending();
+    in->set_tick(input.tick);
+    in->set_source(input.source);
+    in->set_sequence(input.sequence);
+    in->set_kind(static_cast<uint32_t>(input.kind));
+    in->set_body(input.body);
+    in->mutable_linear()->Add(input.linear.data(), input.linear.data() + 3);
+    in->mutable_angular()->Add(input.angular.data(), input.angular.data() + 3);
+  }
+}
+
+// ---- decoding ----
+
+absl::Status Bad(const char* field, const std::string& what) {
+  return absl::InvalidArgumentError(absl::StrCat("frame.", field, ": ", what));
+}
+
+#define AUREOLE_RETURN_IF_ERROR(expression)               \
+  do {                                                    \
+    if (absl::Status s = (expression); !s.ok()) return s; \
+  } while (false)
+
+absl::Status CheckCount(const char* field, int count, size_t limit) {
+  if (static_cast<size_t>(count) > limit) {
+    return Bad(field, absl::StrCat("has ", count, " entries, at most ", limit, " are allowed"));
+  }
+  return absl::OkStatus();
+}
+
+absl::Status CheckColumn(const char* field, int size, int per_entry, size_t entries, bool may_be_empty) {
+  if (may_be_empty && size == 0) return absl::OkStatus();
+  if (static_cast<size_t>(size) != per_entry * entries) {
+    return Bad(field, absl::StrCat("has ", size, " values for ", entries, " entries of ", per_entry));
+  }
+  return absl::OkStatus();
+}
+
+absl::Status DecodeIds(const char* field, const Ids& in, size_t limit, bool ascending, std::vector<BodyId>* out) {
+  AUREOLE_RETURN_IF_ERROR(CheckCount(field, in.size(), limit));
+  out->reserve(in.size());
+  uint64_t last = 0;
+  for (int64_t step : in) {
+    const uint64_t id = last + static_cast<uint64_t>(step);
+    if (id == 0) return Bad(field, "0 is no id");
+    if (ascending && id <= last) return Bad(field, absl::StrCat("body ", id, " after body ", last));
+    out->push_back(last = id);
+  }
+  return absl::OkStatus();
+}
+
+absl::Status DecodeBox(const char* field, BodyId id, const float* in, WireBox* out) {
+  for (int i = 0; i < 3; ++i) {
+    out->min[i] = in[i];
+    out->max[i] = in[3 + i];
+    if (!std::isfinite(in[i]) || !std::isfinite(in[3 + i]) || in[i] > in[3 + i]) {
+      return Bad(field, absl::StrCat("box of body ", id, " is inside out or not finite"));
+    }
+  }
+  return absl::OkStatus();
+}
+
+absl::Status DecodeRegion(const char* field, uint32_t plus_one, RegionId* out) {
+  if (plus_one > kMaxRegions) return Bad(field, absl::StrCat("no region ", plus_one - 1));
+  *out = static_cast<RegionId>(plus_one) - 1;
+  return absl::OkStatus();
+}
+
+absl::Status DecodeAuras(const v1::Frame& in, std::vector<Aura>* out) {
+  std::vector<BodyId> ids;
+  AUREOLE_RETURN_IF_ERROR(DecodeIds("aura_id", in.aura_id(), kMaxAuras, false, &ids));
+  AUREOLE_RETURN_IF_ERROR(CheckColumn("aura_box", in.aura_box_size(), 6, ids.size(), false));
+  AUREOLE_RETURN_IF_ERROR(CheckColumn("aura_owner", in.aura_owner_size(), 1, ids.size(), true));
+  AUREOLE_RETURN_IF_ERROR(CheckColumn("aura_velocity", in.aura_velocity_size(), 3, ids.size(), true));
+  AUREOLE_RETURN_IF_ERROR(CheckColumn("aura_speed", in.aura_speed_size(), 1, ids.size(), true));
+  AUREOLE_RETURN_IF_ERROR(CheckColumn("aura_asleep", in.aura_asleep_size(), 1, ids.size(), true));
+  out->resize(ids.size());
+  for (size_t i = 0; i < ids.size(); ++i) {
+    Aura& a = (*out)[i];
+    const int n = static_cast<int>(i);
+    a.id = ids[i];
+    AUREOLE_RETURN_IF_ERROR(DecodeBox("aura_box", a.id, in.aura_box().data() + 6 * i, &a.box));
+    if (in.aura_owner_size() > 0) AUREOLE_RETURN_IF_ERROR(DecodeRegion("aura_owner", in.aura_owner(n), &a.owner));
+    for (int axis = 0; axis < 3 && in.aura_velocity_size() > 0; ++axis) {
+      a.velocity[axis] = in.aura_velocity(3 * n + axis);
+      if (!std::isfinite(a.velocity[axis])) return Bad("aura_velocity", absl::StrCat("of body ", a.id));
+    }
+    if (in.aura_speed_size() > 0) a.speed = in.aura_speed(n);
+    if (!std::isfinite(a.speed) || a.speed < 0) return Bad("aura_speed", absl::StrCat("of body ", a.id));
+    if (in.aura_asleep_size() > 0) a.asleep = in.aura_asleep(n);
+  }
+  return absl::OkStatus();
+}
+
+absl::Status DecodeEdges(const v1::Frame& in, std::vector<Edge>* out) {
+  std::vector<BodyId> a;
+  AUREOLE_RETURN_IF_ERROR(DecodeIds("edge_a", in.edge_a(), kMaxEdges, false, &a));
+  AUREOLE_RETURN_IF_ERROR(CheckColumn("edge_step", in.edge_step_size(), 1, a.size(), false));
+  out->reserve(a.size());
+  for (size_t i = 0; i < a.size(); ++i) {
+    const uint64_t b = a[i] + in.edge_step(static_cast<int>(i));
+    if (b <= a[i]) return Bad("edge_step", absl::StrCat("edge of body ", a[i], " to body ", b));
+    out->push_back({a[i], b});
+  }
+  return absl::OkStatus();
+}
+
+absl::Status DecodeFragment(const v1::Frame::Fragment& in, Fragment* out) {
+  AUREOLE_RETURN_IF_ERROR(DecodeIds("fragment.known", in.known(), kMaxAuras, true, &out->known));
+  if (out->known.empty()) return Bad("fragment.known", "is empty");
+  out->id = in.id();
+  out->bodies = in.bodies();
+  if (out->id == 0 || out->id > out->known[0]) return Bad("fragment.id", absl::StrCat(out->id, " is no smallest id"));
+  if (out->bodies < out->known.size()) return Bad("fragment.bodies", absl::StrCat(out->bodies, ", more are named"));
+  AUREOLE_RETURN_IF_ERROR(CheckCount("fragment.home", in.home_size(), kMaxRegions));
+  AUREOLE_RETURN_IF_ERROR(CheckColumn("fragment.mass", in.mass_size(), 1, in.home_size(), false));
+  for (int i = 0; i < in.home_size(); ++i) {
+    if (in.home(i) >= kMaxRegions || (i > 0 && in.home(i) <= in.home(i - 1))) {
+      return Bad("fragment.home", absl::StrCat(in.home(i), " is out of range or order"));
+    }
+    if (!std::isfinite(in.mass(i)) || in.mass(i) < 0) return Bad("fragment.mass", absl::StrCat(in.mass(i), " kg"));
+    out->mass_by_home.emplace_back(static_cast<RegionId>(in.home(i)), in.mass(i));
+  }
+  return DecodeRegion("fragment.gives_back", in.gives_back(), &out->gives_back);
+}
+
+absl::Status DecodeVector(const char* field, const Doubles& in, Vec3* out) {
+  AUREOLE_RETURN_IF_ERROR(CheckColumn(field, in.size(), 3, 1, false));
+  *out = Vec3(in.Get(0), in.Get(1), in.Get(2));
+  if (!out->allFinite()) return Bad(field, "is not finite");
+  return absl::OkStatus();
+}
+
+absl::Status DecodeInput(const v1::Frame::Input& in, Input* out) {
+  if (in.kind() < static_cast<uint32_t>(Input::Kind::kRemove) ||
+      in.kind() > static_cast<uint32_t>(Input::Kind::kVelocity)) {
+    return Bad("transfer.pending.kind", absl::StrCat("no input of kind ", in.kind(), " travels"));
+  }
+  if (in.tick() < 0 || in.body() == 0) return Bad("transfer.pending", "has no tick or no body");
+  out->tick = in.tick();
+  out->source = in.source();
+  out->sequence = in.sequence();
+  out->kind = static_cast<Input::Kind>(in.kind());
+  out->body = in.body();
+  AUREOLE_RETURN_IF_ERROR(DecodeVector("transfer.pending.linear", in.linear(), &out->linear));
+  return DecodeVector("transfer.pending.angular", in.angular(), &out->angular);
+}
+
+// Takes the state's bytes out of `in`.
+absl::Status DecodeTransfer(v1::Frame::Transfer* in, Transfer* out) {
+  AUREOLE_RETURN_IF_ERROR(DecodeIds("transfer.id", in->id(), kMaxTransferBodies, true, &out->ids));
+  if (out->ids.empty()) return Bad("transfer.id", "is empty");
+  AUREOLE_RETURN_IF_ERROR(CheckColumn("transfer.epoch", in->epoch_size(), 1, out->ids.size(), false));
+  out->epochs.assign(in->epoch().begin(), in->epoch().end());
+  if (in->cause() < static_cast<uint32_t>(TransferCause::kAuraCollision) ||
+      in->cause() > static_cast<uint32_t>(TransferCause::kDrain)) {
+    return Bad("transfer.cause", absl::StrCat("no cause ", in->cause()));
+  }
+  out->cause = static_cast<TransferCause>(in->cause());
+  if (in->state().empty()) return Bad("transfer.state", "is empty");
+  out->state = std::move(*in->mutable_state());
+  AUREOLE_RETURN_IF_ERROR(CheckCount("transfer.pending", in->pending_size(), kMaxPending));
+  out->pending.resize(in->pending_size());
+  for (int i = 0; i < in->pending_size(); ++i) AUREOLE_RETURN_IF_ERROR(DecodeInput(in->pending(i), &out->pending[i]));
+  return absl::OkStatus();
+}
+
+// Bytes that this version does not know are not skipped: the handshake has settled the version.
+bool HasUnknownFields(const google::protobuf::Message& message) {
+  return !message.GetReflection()->GetUnknownFields(message).empty();
+}
+
+bool AnyUnknownFields(const v1::Frame& frame) {
+  bool any = HasUnknownFields(frame);
+  for (const auto& f : frame.fragment()) any |= HasUnknownFields(f);
+  for (const auto& t : frame.transfer()) {
+    any |= HasUnknownFields(t);
+    for (const auto& p : t.pending()) any |= HasUnknownFields(p);
+  }
+  return any;
+}
+
+}  // namespace
+
+std::string EncodeFrame(const Frame& frame) {
+  AUREOLE_CHECK(
+      frame.auras.size() <= kMaxAuras && frame.gone.size() <= kMaxAuras && frame.away.size() <= kMaxAuras &&
+          frame.away_gone.size() <= kMaxAuras && frame.edges.size() <= kMaxEdges &&
+          frame.fragments.size() <= kMaxFragments && frame.transfers.size() <= kMaxTransfers,
+      "frame of region %d, tick %lld is beyond link_limits.h: %zu auras, %zu edges, %zu fragments, %zu transfers",
+      frame.from, static_cast<long long>(frame.tick), frame.auras.size(), frame.edges.size(), frame.fragments.size(),
+      frame.transfers.size());
+  v1::Frame out;
+  out.set_phase(static_cast<uint64_t>(frame.tick) * 4 + static_cast<uint64_t>(frame.round));
+  EncodeAuras(frame.auras, &out);
+  IdWriter gone(out.mutable_gone_id());
+  for (BodyId id : frame.gone) gone.Add(id);
+  IdWriter edges(out.mutable_edge_a());
+  for (const Edge& e : frame.edges) {
+    edges.Add(e.a);
+    out.add_edge_step(e.b - e.a);
+  }
+  for (const Fragment& f : frame.fragments) EncodeFragment(f, out.add_fragment());
+  for (const Transfer& t : frame.transfers) EncodeTransfer(t, out.add_transfer());
+  IdWriter away(out.mutable_away_id());
+  for (const Away& a : frame.away) {
+    away.Add(a.id);
+    out.add_away_owner(static_cast<uint32_t>(a.owner + 1));
+    AddBox(a.box, out.mutable_away_box());
+  }
+  IdWriter away_gone(out.mutable_away_gone_id());
+  for (BodyId id : frame.away_gone) away_gone.Add(id);
+  AUREOLE_CHECK(out.ByteSizeLong() <= kMaxFrameBytes, "frame of region %d, tick %lld has %zu bytes", frame.from,
+                static_cast<long long>(frame.tick), out.ByteSizeLong());
+  return out.SerializeAsString();
+}
+
+absl::StatusOr<Frame> DecodeFrame(std::string_view bytes, RegionId from, RegionId to) {
+  if (bytes.size() > kMaxFrameBytes)
+    return absl::InvalidArgumentError(absl::StrCat("frame of ", bytes.size(), " bytes"));
+  v1::Frame in;
+  if (!in.ParseFromArray(bytes.data(), static_cast<int>(bytes.size()))) {
+    return absl::InvalidArgumentError("frame: these bytes are not a Frame message");
+  }
+  if (AnyUnknownFields(in)) return absl::InvalidArgumentError("frame: has fields that this version does not know");
+
+  Frame out;
+  out.from = from;
+  out.to = to;
+  out.round = static_cast<int>(in.phase() % 4);
+  out.tick = static_cast<Tick>(in.phase() / 4);
+  if (out.round > 2) return Bad("phase", "no round 3");
+  AUREOLE_RETURN_IF_ERROR(DecodeAuras(in, &out.auras));
+  AUREOLE_RETURN_IF_ERROR(DecodeIds("gone_id", in.gone_id(), kMaxAuras, false, &out.gone));
+  AUREOLE_RETURN_IF_ERROR(DecodeEdges(in, &out.edges));
+  AUREOLE_RETURN_IF_ERROR(CheckCount("fragment", in.fragment_size(), kMaxFragments));
+  out.fragments.resize(in.fragment_size());
+  for (int i = 0; i < in.fragment_size(); ++i) {
+    AUREOLE_RETURN_IF_ERROR(DecodeFragment(in.fragment(i), &out.fragments[i]));
+  }
+  AUREOLE_RETURN_IF_ERROR(CheckCount("transfer", in.transfer_size(), kMaxTransfers));
+  out.transfers.resize(in.transfer_size());
+  for (int i = 0; i < in.transfer_size(); ++i) {
+    AUREOLE_RETURN_IF_ERROR(DecodeTransfer(in.mutable_transfer(i), &out.transfers[i]));
+  }
+  std::vector<BodyId> away;
+  AUREOLE_RETURN_IF_ERROR(DecodeIds("away_id", in.away_id(), kMaxAuras, false, &away));
+  AUREOLE_RETURN_IF_ERROR(CheckColumn("away_owner", in.away_owner_size(), 1, away.size(), false));
+  AUREOLE_RETURN_IF_ERROR(CheckColumn("away_box", in.away_box_size(), 6, away.size(), false));
+  out.away.resize(away.size());
+  for (size_t i = 0; i < away.size(); ++i) {
+    Away& a = out.away[i];
+    a.id = away[i];
+    AUREOLE_RETURN_IF_ERROR(DecodeRegion("away_owner", in.away_owner(static_cast<int>(i)), &a.owner));
+    AUREOLE_RETURN_IF_ERROR(DecodeBox("away_box", a.id, in.away_box().data() + 6 * i, &a.box));
+  }
+  AUREOLE_RETURN_IF_ERROR(DecodeIds("away_gone_id", in.away_gone_id(), kMaxAuras, false, &out.away_gone));
+  return out;
+}
+
+}  // namespace aureole

@@ -1,0 +1,160 @@
+// One link: the frames between this region and one peer, exactly once and in order, over any number of connections.
+//
+// Frames to send are kept until the peer has acknowledged them; a new connection goes on after the last one that the
+// peer applied (server/core/link.h, P54). One write is in flight at a time. The side with the lower region id dials,
+// and dials again when the connection ends, 50 ms to 1 s later (P57). Nothing here waits: the tick thread only ever
+// queues a frame, and received frames are handed to `deliver`.
+#pragma once
+
+#include <chrono>
+#include <condition_variable>
+#include <cstdint>
+#include <deque>
+#include <functional>
+#include <memory>
+#include <mutex>
+#include <string>
+#include <utility>
+
+#include <absl/status/status.h>
+#include <absl/status/statusor.h>
+#include <grpcpp/alarm.h>
+#include <grpcpp/channel.h>
+
+#include "aureole/v1/peer.grpc.pb.h"
+#include "server/core/frame.h"
+#include "server/core/link.h"
+
+namespace aureole {
+
+// What both ends of a link must agree on, and who this end is.
+struct LinkIdentity {
+  uint32_t protocol_version = 0;
+  uint64_t world_hash = 0;
+  uint64_t layout_epoch = 0;
+  RegionId self = kNoRegion;
+  uint64_t incarnation = 1;  // from 1
+  int exchange_delay = 0;    // k
+  int64_t tick_us = 0;
+};
+
+// FailedPrecondition says what differs and what to do, when `hello` is not from the same world, layout, protocol
+// version and exchange, or not for this region.
+absl::Status CheckHello(const LinkIdentity& identity, const v1::LinkHello& hello);
+
+// A serialised frame; shared, since a broadcast goes to every link.
+using EncodedFrame = std::shared_ptr<const std::string>;
+
+// Totals since the start.
+struct LinkStats {
+  int64_t frames_sent = 0;      // written, frames repeated after a reconnect included
+  int64_t frames_received = 0;  // applied
+  int64_t bytes_sent = 0;       // of messages: payload, without gRPC's framing
+  int64_t connections = 0;      // that passed the handshake
+  int64_t reconnects = 0;       // of these, all but the first
+  int64_t refused_hellos = 0;
+  int64_t refused_frames = 0;  // malformed, or out of sequence
+  int64_t duplicates = 0;
+  friend bool operator==(const LinkStats&, const LinkStats&) = default;
+};
+
+// One connection of a link; the dialled and the accepted kind differ only in gRPC's classes. Its fields are guarded by
+// the link's mutex once the link has it.
+class LinkStream {
+ public:
+  virtual ~LinkStream() = default;
+  virtual void StartWriting(const v1::PeerMessage* message) = 0;
+  // Ends the connection soon, from any thread.
+  virtual void Cancel() = 0;
+
+  v1::PeerMessage out;                                  // the message in flight
+  bool writing = false;                                 // a write is in flight
+  bool open = false;                                    // the peer's hello was accepted, and no write has failed
+  bool ended = false;                                   // no write may start any more
+  std::deque<std::pair<uint64_t, EncodedFrame>> queue;  // numbered frames that this connection has still to carry
+  size_t written = 0;                                   // bytes of the first of them already written, in parts
+  bool sequence_said = false;                           // the numbers have begun
+  // Only touched by the stream's reads, which come one at a time.
+  bool greeted = false;    // the peer's hello was accepted
+  uint64_t last_read = 0;  // number of the last frame begun; 0: none yet
+  std::string parts;       // of the frame that is being received
+  bool in_parts = false;
+};
+
+class PeerLink {
+ public:
+  struct Options {
+    LinkIdentity identity;
+    RegionId peer = kNoRegion;
+    // Takes the next frame of the peer; from a gRPC thread, one at a time. Must be quick and not call this link.
+    std::function<void(Frame)> deliver;
+    // Told of what an operator wants to know: connected, lost, refused. From a gRPC thread; must not call this link.
+    std::function<void(RegionId peer, const std::string& what)> log;
+  };
+
+  explicit PeerLink(Options options);
+  // Closes.
+  ~PeerLink();
+  PeerLink(const PeerLink&) = delete;
+  PeerLink& operator=(const PeerLink&) = delete;
+
+  RegionId peer() const { return options_.peer; }
+
+  // Connects, and stays connected until Close. Once; only the side with the lower id.
+  void Dial(const std::string& endpoint);
+  // Any thread; never waits for the network.
+  void Send(EncodedFrame frame);
+  // Ends the present connection, if any, as a fault of the network would; the link resumes. Any thread.
+  void Cut();
+  // Waits until every frame was written to a connection; false when that took longer.
+  bool AwaitWritten(std::chrono::milliseconds at_most);
+  // Ends the connection and waits until no callback will come any more. Idempotent.
+  void Close();
+
+  LinkStats stats() const;
+
+  // Below: called by streams.
+
+  // The peer has dialled and said `hello`. When OK, the stream belongs to this link and has its answer under way.
+  absl::Status Attach(LinkStream* stream, const v1::LinkHello& hello);
+  // Anything that a stream has read. Not OK: the connection must end, for this reason.
+  absl::Status Read(LinkStream* stream, v1::PeerMessage* message);
+  // A write is done. True when the stream has ended meanwhile.
+  bool Written(LinkStream* stream, bool ok);
+  // Nothing more will be read, and no further write may start. True when none is in flight.
+  bool End(LinkStream* stream);
+  // The stream will not call again. `status` is the dialled side's verdict.
+  void Gone(LinkStream* stream, const grpc::Status& status);
+
+ private:
+  v1::LinkHello Hello() const;
+  absl::Status Accept(LinkStream* stream, const v1::LinkHello& hello);
+  absl::Status ReadHello(LinkStream* stream, const v1::LinkHello& hello);
+  void LogOnce(const std::string& why);
+  absl::StatusOr<bool> Assemble(LinkStream* stream, v1::PeerMessage* message, std::string* frame) const;
+  absl::Status Apply(LinkStream* stream, const v1::PeerMessage& message, Frame* frame);
+  void Pump(LinkStream* stream);
+  void Connect();
+  void Redial();
+
+  const Options options_;
+  std::shared_ptr<grpc::Channel> channel_;
+  std::unique_ptr<v1::Peer::Stub> stub_;
+
+  mutable std::mutex mutex_;
+  std::condition_variable changed_;
+  LinkSender<EncodedFrame> sender_;
+  LinkReceiver receiver_;
+  uint64_t told_ = 0;              // what the peer knows that we applied
+  uint64_t peer_incarnation_ = 0;  // 0: not met yet
+  LinkStream* current_ = nullptr;
+  int streams_ = 0;  // that still may call
+  bool closed_ = false;
+  bool redialling_ = false;
+  int backoff_ms_;
+  std::string last_refusal_;  // so that a standing refusal is logged once
+  LinkStats stats_;
+  std::unique_ptr<grpc::Alarm> alarm_;  // the next dial
+};
+
+}  // namespace aureole

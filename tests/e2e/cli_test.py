@@ -1,0 +1,318 @@
+"""The command line as a user meets it: on a terminal, in a pipe, with bad input, with processes that die.
+
+Usage: cli_test.py BIN_DIRECTORY SOURCE_DIRECTORY
+"""
+
+import contextlib
+import fcntl
+import json
+import os
+import pathlib
+import pty
+import select
+import signal
+import stat
+import subprocess
+import sys
+import tempfile
+import termios
+import time
+import unittest
+
+BIN = pathlib.Path(sys.argv[1])
+SOURCE = pathlib.Path(sys.argv[2])
+WORLDS = SOURCE / "tests" / "worlds"
+AUREOLE = str(BIN / "aureole")
+DEADLINE_S = 60
+
+
+def children(pid):
+    found = []
+    for entry in os.listdir("/proc"):
+        if not entry.isdigit():
+            continue
+        with contextlib.suppress(OSError):
+            fields = pathlib.Path("/proc", entry, "stat").read_text().rpartition(")")[2].split()
+            if int(fields[1]) == pid and fields[0] != "Z":
+                found.append(int(entry))
+    return sorted(found)
+
+
+def alive(pid):
+    with contextlib.suppress(OSError):
+        return pathlib.Path("/proc", str(pid), "stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    return False
+
+
+def wait_for(condition, what):
+    until = time.monotonic() + DEADLINE_S
+    while True:
+        value = condition()
+        if value:
+            return value
+        if time.monotonic() > until:
+            raise AssertionError("never happened: " + what)
+        time.sleep(0.01)
+
+
+class Cli(unittest.TestCase):
+    def setUp(self):
+        self.directory = tempfile.TemporaryDirectory()
+        self.path = pathlib.Path(self.directory.name)
+        self.processes = []
+
+    def tearDown(self):
+        for process in self.processes:
+            if process.poll() is None:
+                process.kill()
+            process.wait()
+            for stream in (process.stdout, process.stderr):
+                if stream:
+                    stream.close()
+        self.directory.cleanup()
+
+    def fake(self, flags=""):
+        """A region server without a world; leaves a mark when it is started."""
+        script = self.path / "server"
+        script.write_text(f'#!/bin/sh\ntouch {self.path}/started\nexec {BIN}/fake_region {flags} "$@"\n')
+        script.chmod(script.stat().st_mode | stat.S_IXUSR)
+        return ["--region-server", str(script)]
+
+    def started(self):
+        return (self.path / "started").exists()
+
+    def start(self, *arguments, **kwargs):
+        environment = {**os.environ, "TMPDIR": self.directory.name}  # logs that are kept go with the test
+        kwargs = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": environment, **kwargs}
+        process = subprocess.Popen([AUREOLE, *map(str, arguments)], **kwargs)
+        self.processes.append(process)
+        return process
+
+    def run_cli(self, *arguments):
+        process = self.start(*arguments)
+        out, err = process.communicate(timeout=DEADLINE_S)
+        return process.returncode, out, err
+
+    def servers_of(self, process, number):
+        return wait_for(lambda: (lambda c: c if len(c) == number else None)(children(process.pid)), "servers")
+
+    def assert_gone(self, pids):
+        wait_for(lambda: not any(alive(p) for p in pids), f"end of {pids}")
+
+
+class Terminal(Cli):
+    def test_table_is_redrawn_in_place_and_control_c_ends_everything(self):
+        master, slave = pty.openpty()
+        process = self.start("up", WORLDS / "demo.json", *self.fake(), stdin=slave, stdout=slave, stderr=slave,
+                             start_new_session=True, text=False,
+                             preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0))
+        os.close(slave)
+        text = b""
+        until = time.monotonic() + DEADLINE_S
+        while text.count(b"\x1b[10A") < 2 and time.monotonic() < until:
+            if select.select([master], [], [], 1)[0]:
+                text += os.read(master, 65536)
+        self.assertGreaterEqual(text.count(b"demo: running, 4 regions"), 2)
+        for word in (b"region ", b"awake", b"asleep", b"p99 ms", b"transfers", b"waits", b"all "):
+            self.assertIn(word, text)
+        servers = self.servers_of(process, 4)
+        os.write(master, b"\x03")
+        self.assertEqual(process.wait(DEADLINE_S), 0)
+        self.assert_gone(servers)
+        os.close(master)
+
+
+class Processes(Cli):
+    def test_killed_parent_leaves_no_server(self):
+        process = self.start("up", WORLDS / "demo.json", *self.fake())
+        servers = self.servers_of(process, 4)
+        process.kill()
+        self.assert_gone(servers)
+
+    def test_killed_server_fails_the_run_by_name(self):
+        process = self.start("up", WORLDS / "demo.json", *self.fake())
+        servers = self.servers_of(process, 4)
+        wait_for(lambda: "tick" in process.stdout.readline(), "a tick")
+        os.kill(servers[2], signal.SIGKILL)
+        out, err = process.communicate(timeout=DEADLINE_S)
+        self.assertEqual(process.returncode, 1, err)
+        self.assertIn("the server of region 2 ended: killed by signal 9 (Killed)", err)
+        self.assert_gone(servers)
+
+    def test_server_that_fails_shows_the_tail_of_its_log(self):
+        code, _, err = self.run_cli("up", WORLDS / "demo.json", "--duration", "60s", "--logs", self.path / "logs",
+                                    *self.fake("--die-at 50 --fail-region 1"))
+        self.assertEqual(code, 1)
+        self.assertIn("the server of region 1 ended: exit status 3; its log is ", err)
+        self.assertIn("  | fake: dies at tick 50", err)
+
+    def test_terminate_and_hang_up_end_everything(self):
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            process = self.start("up", WORLDS / "demo.json", *self.fake())
+            servers = self.servers_of(process, 4)
+            process.send_signal(number)
+            process.communicate(timeout=DEADLINE_S)
+            self.assertEqual(process.returncode, 0)
+            self.assert_gone(servers)
+
+    def test_second_interrupt_kills_servers_that_take_their_time(self):
+        process = self.start("up", WORLDS / "demo.json", "--duration", "60s", *self.fake("--ignore-stop"))
+        servers = self.servers_of(process, 4)
+        wait_for(lambda: "tick" in process.stdout.readline(), "a tick")
+        began = time.monotonic()
+        wait_for(lambda: process.send_signal(signal.SIGINT) or process.poll() is not None, "the end")
+        self.assertLess(time.monotonic() - began, 8)
+        self.assertEqual(process.returncode, 130)
+        self.assert_gone(servers)
+
+    def test_reader_that_goes_away_ends_the_run(self):
+        process = self.start("up", WORLDS / "demo.json", *self.fake())
+        servers = self.servers_of(process, 4)
+        process.stdout.readline()
+        process.stdout.close()
+        process.stdout = None
+        process.communicate(timeout=DEADLINE_S)
+        self.assert_gone(servers)
+
+
+class Input(Cli):
+    def refused(self, *arguments):
+        code, out, err = self.run_cli(*arguments, *self.fake())
+        self.assertEqual(code, 2, err)
+        self.assertEqual(out, "")
+        self.assertFalse(self.started(), "nothing is started")
+        return err
+
+    def test_every_broken_world_is_refused_with_its_path(self):
+        bad = sorted((WORLDS / "bad").glob("*.json"))
+        self.assertGreaterEqual(len(bad), 40)
+        for world in bad:
+            err = self.refused("up", world)
+            self.assertTrue(err.startswith(f"{world}: "), err)
+            self.assertGreater(len(err.split(": ")), 2, err)
+
+    def test_missing_file_and_directory_are_refused(self):
+        self.assertIn("nowhere.json: ", self.refused("up", self.path / "nowhere.json"))
+        self.assertIn(f"{self.path}: ", self.refused("up", self.path))
+        self.assertIn("nowhere.json: ", self.refused("experiment", WORLDS / "demo.json", self.path / "nowhere.json"))
+
+    def test_bad_flags_are_refused_with_the_flag(self):
+        demo = WORLDS / "demo.json"
+        for flags, word in ((["--duration", "5 parsecs"], "--duration"), (["--duration", "-3s"], "--duration"),
+                            (["--duration", "inf"], "--duration"), (["--hash-every", "-1"], "--hash-every"),
+                            (["--frobnicate"], "--frobnicate")):
+            self.assertIn(word, self.refused("up", demo, *flags))
+        self.assertIn("--repeat", self.refused("experiment", demo, "--repeat", "0"))
+        blocked = self.path / "file"
+        blocked.write_text("")
+        self.assertIn("--out", self.refused("experiment", demo, "--out", blocked / "below"))
+
+    def test_check_describes_good_worlds_and_stops_at_a_broken_one(self):
+        code, out, _ = self.run_cli("check", WORLDS / "demo.json")
+        self.assertEqual(code, 0)
+        for word in ("demo: 4 regions", "m = ", "paper (Eqs. 1-4): T_R", "ours (k = "):
+            self.assertIn(word, out)
+        broken = sorted((WORLDS / "bad").glob("*.json"))[0]
+        code, _, err = self.run_cli("check", WORLDS / "demo.json", broken)
+        self.assertEqual(code, 2)
+        self.assertTrue(err.startswith(str(broken)))
+
+    def test_help_has_examples_and_exit_codes(self):
+        for command in ([], ["up"], ["experiment"], ["check"]):
+            code, out, _ = self.run_cli(*command, "--help")
+            self.assertEqual(code, 0)
+            self.assertIn("Example", out)
+            self.assertIn("Exit codes: 0 fine; 1", out)
+
+
+class Results(Cli):
+    def test_json_is_all_of_the_output(self):
+        code, out, err = self.run_cli("up", WORLDS / "demo.json", "--duration", "10s", "--no-real-time", "--json",
+                                      *self.fake())
+        self.assertEqual((code, err), (0, ""))
+        result = json.loads(out)
+        self.assertTrue(result["ok"])
+        self.assertEqual((result["tick"], result["bodies"], len(result["regions"])), (625, 120, 4))
+        self.assertEqual([h["tick"] for h in result["hashes"]], [100, 200, 300, 400, 500, 600, 625])
+
+    def test_interrupted_before_the_end_is_said(self):
+        process = self.start("up", WORLDS / "demo.json", "--duration", "60s", *self.fake())
+        wait_for(lambda: "tick" in process.stdout.readline(), "a tick")
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=DEADLINE_S)
+        self.assertEqual(process.returncode, 130)
+
+    def experiment(self, flags=""):
+        return self.run_cli("experiment", WORLDS / "paper" / "column-1.json", WORLDS / "paper" / "column-4.json",
+                            WORLDS / "paper" / "corner-4.json", "--duration", "10s", "--no-real-time", "--out",
+                            self.path / "out", *self.fake(flags))
+
+    def test_experiment_writes_its_files(self):
+        code, out, err = self.experiment()
+        self.assertEqual(code, 0, err)
+        self.assertIn("column-4", out)
+        self.assertEqual(sorted(p.name for p in (self.path / "out").iterdir()),
+                         ["columns.svg", "corners.svg", "experiment.csv", "experiment.json"])
+        result = json.loads((self.path / "out" / "experiment.json").read_text())
+        self.assertEqual([r["world"] for r in result["runs"]], ["column-1", "column-4", "corner-4"])
+        for run in result["runs"]:
+            self.assertTrue(run["hash_equal"], run)
+            self.assertEqual((run["lost"], run["doubled"], run["violations"]), (0, 0, 0))
+            self.assertEqual(len(run["windows"]), 2)
+
+    def test_experiment_that_is_not_exact_fails_and_says_where(self):
+        code, out, err = self.experiment("--wrong-hash --fail-region 1")
+        self.assertEqual(code, 1)
+        self.assertIn("column-4: differs from the undivided run, first at tick 200", out)
+        code, out, err = self.experiment("--lose-at 300 --fail-region 1")
+        self.assertEqual(code, 1)
+        runs = json.loads((self.path / "out" / "experiment.json").read_text())["runs"]
+        self.assertEqual([r["lost"] for r in runs], [0, 1, 1])
+
+    def test_interrupted_experiment_leaves_no_server(self):
+        process = self.start("experiment", WORLDS / "paper" / "column-4.json", "--out", self.path / "out",
+                             *self.fake())
+        servers = self.servers_of(process, 1)  # the undivided run comes first
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=DEADLINE_S)
+        self.assertEqual(process.returncode, 130)
+        self.assert_gone(servers)
+
+
+class Exactness(Cli):
+    """With real region servers."""
+
+    def hashes(self, world, *flags):
+        code, out, err = self.run_cli("up", WORLDS / world, "--duration", "5s", "--no-real-time", "--json",
+                                      "--hash-every", "25", *flags)
+        self.assertEqual(code, 0, err)
+        result = json.loads(out)
+        self.assertEqual(result["violations"], 0)
+        return result["hashes"], result["transfers"]
+
+    def test_split_world_is_the_undivided_one(self):
+        for world in ("border-pile.json", "demo.json"):
+            split, transfers = self.hashes(world)
+            undivided, none = self.hashes(world, "--undivided")
+            self.assertEqual(split, undivided)
+            self.assertEqual(len(split), 13)
+            self.assertGreater(transfers, 0)
+            self.assertEqual(none, 0)
+
+    def test_stopped_server_is_waited_for_by_name_and_changes_nothing(self):
+        expected, _ = self.hashes("border-pile.json")
+        process = self.start("up", WORLDS / "border-pile.json", "--duration", "5s", "--hash-every", "25",
+                             "--logs", self.path / "logs")
+        servers = self.servers_of(process, 2)
+        wait_for(lambda: "tick" in process.stdout.readline(), "a tick")
+        os.kill(servers[1], signal.SIGSTOP)
+        wait_for(lambda: "region 0 waits for region 1" in process.stdout.readline(), "the wait")
+        wait_for(lambda: "nothing heard of region 1 for" in process.stdout.readline(), "the silence")
+        os.kill(servers[1], signal.SIGCONT)
+        out, err = process.communicate(timeout=DEADLINE_S)
+        self.assertEqual(process.returncode, 0, err)
+        self.assertIn(f"state hash {expected[-1]['hash']} at tick {expected[-1]['tick']}", out)
+
+
+if __name__ == "__main__":
+    unittest.main(argv=sys.argv[:1], verbosity=2)

@@ -1,0 +1,263 @@
+// One run, from the first Hello to the last Stop, with made-up region servers in threads.
+#include "server/control/run.h"
+
+#include <gtest/gtest.h>
+
+#include <map>
+#include <memory>
+#include <mutex>
+#include <thread>
+
+#include "tests/e2e/fake_region.h"
+
+namespace aureole {
+namespace {
+
+using ::testing::Test;
+
+class FakeAllocator final : public Allocator {
+ public:
+  explicit FakeAllocator(FakeBehaviour behaviour) : behaviour_(std::move(behaviour)) {}
+  ~FakeAllocator() override { Kill(); }
+
+  absl::Status Start(const ServerStart& start) override {
+    auto server = std::make_unique<Server>();
+    Server* s = server.get();
+    s->region = start.region;
+    s->fake = std::make_unique<FakeRegion>(start.control, start.token, behaviour_);
+    s->thread = std::thread([s] {
+      s->exit = s->fake->Run();
+      s->ended = true;
+    });
+    servers_.push_back(std::move(server));
+    return absl::OkStatus();
+  }
+  std::vector<ServerExit> Poll() override {
+    std::vector<ServerExit> out;
+    for (const auto& s : servers_) {
+      if (!s->ended || !s->thread.joinable()) continue;
+      s->thread.join();
+      out.push_back({s->region, s->exit == 0, "exit status " + std::to_string(s->exit), "", "its last words"});
+    }
+    return out;
+  }
+  int running() const override {
+    int n = 0;
+    for (const auto& s : servers_) n += s->thread.joinable() ? 1 : 0;
+    return n;
+  }
+  void Kill() override {
+    for (const auto& s : servers_) {
+      if (!s->thread.joinable()) continue;
+      s->fake->Cancel();
+      s->thread.join();
+      ++killed;
+    }
+  }
+  int killed = 0;
+
+ private:
+  struct Server {
+    RegionId region = kNoRegion;
+    std::unique_ptr<FakeRegion> fake;
+    std::thread thread;
+    int exit = 0;
+    std::atomic<bool> ended = false;
+  };
+  const FakeBehaviour behaviour_;
+  std::vector<std::unique_ptr<Server>> servers_;
+};
+
+class RunTest : public Test {
+ protected:
+  RunTest() {
+    options_.regions = 3;
+    options_.no_real_time = true;
+    options_.last_tick = 650;
+    options_.hash_every = 100;
+  }
+  absl::Status RunFakes(
+      FakeBehaviour behaviour, RunObserver observe = [](const RunStatus&) { return true; }) {
+    FakeAllocator allocator(std::move(behaviour));
+    const absl::Status s = RunWorld(options_, allocator, observe, &result_);
+    EXPECT_EQ(allocator.running(), 0);
+    killed_ = allocator.killed;
+    return s;
+  }
+  RunOptions options_;
+  RunResult result_;
+  int killed_ = 0;
+};
+
+TEST_F(RunTest, HashesAndBodiesOfAllRegionsAddUp) {
+  ASSERT_TRUE(RunFakes({}).ok());
+  EXPECT_EQ(result_.status.stage, Stage::kFinished);
+  ASSERT_EQ(result_.hashes.size(), 7u);  // every 100th tick and the last
+  for (const TickSum& sum : result_.hashes) {
+    EXPECT_EQ(sum.hash, FakeHash(sum.tick));
+    EXPECT_EQ(sum.bodies, kFakeBodies);
+    EXPECT_EQ(sum.regions, 3);
+  }
+  EXPECT_EQ(result_.hashes.back().tick, 650);
+  EXPECT_EQ(result_.status.MinTick(), 650);
+  EXPECT_EQ(result_.status.Bodies(), kFakeBodies);
+  ASSERT_EQ(result_.windows.size(), 3u);
+  EXPECT_EQ(result_.windows[2].size(), 2u);
+  EXPECT_EQ(killed_, 0);
+}
+
+TEST_F(RunTest, UndividedRunHasOneServer) {
+  options_.undivided = true;
+  ASSERT_TRUE(RunFakes({}).ok());
+  EXPECT_EQ(result_.status.regions.size(), 1u);
+  EXPECT_EQ(result_.hashes.back().hash, FakeHash(650));
+}
+
+TEST_F(RunTest, ObserverSeesTheRunAndEndsIt) {
+  options_.last_tick = 0;
+  options_.no_real_time = false;
+  int calls = 0;
+  const absl::Status s = RunFakes({}, [&calls](const RunStatus& status) {
+    ++calls;
+    return status.MinTick() < 50;
+  });
+  EXPECT_TRUE(absl::IsCancelled(s)) << s;
+  EXPECT_GT(calls, 1);
+  EXPECT_GE(result_.status.MinTick(), 50);
+}
+
+TEST_F(RunTest, ServerThatDiesFailsTheRunByName) {
+  FakeBehaviour behaviour;
+  behaviour.die_at = 100;
+  behaviour.fail_region = 1;
+  const absl::Status s = RunFakes(behaviour);
+  EXPECT_TRUE(absl::IsAborted(s)) << s;
+  EXPECT_NE(s.message().find("region 1 ended: exit status 3"), std::string::npos) << s;
+  EXPECT_NE(s.message().find("its last words"), std::string::npos) << s;
+}
+
+TEST_F(RunTest, GoodbyeOfAServerIsPartOfTheMessage) {
+  FakeBehaviour behaviour;
+  behaviour.goodbye = "no room";
+  behaviour.fail_region = 2;
+  const absl::Status s = RunFakes(behaviour);
+  EXPECT_TRUE(absl::IsAborted(s)) << s;
+  EXPECT_NE(s.message().find("region 2"), std::string::npos) << s;
+  EXPECT_NE(s.message().find("no room"), std::string::npos) << s;
+}
+
+TEST_F(RunTest, ServerThatIsNeverReadyIsNamedAfterTheTimeout) {
+  FakeBehaviour behaviour;
+  behaviour.never_ready = true;
+  behaviour.fail_region = 2;
+  options_.join_timeout = std::chrono::seconds(1);
+  const absl::Status s = RunFakes(behaviour);
+  EXPECT_TRUE(absl::IsDeadlineExceeded(s)) << s;
+  EXPECT_NE(s.message().find("region 2 loads the world"), std::string::npos) << s;
+}
+
+TEST_F(RunTest, ServerThatIgnoresStopIsKilledAndCounted) {
+  FakeBehaviour behaviour;
+  behaviour.ignore_stop = true;
+  behaviour.fail_region = 0;
+  options_.stop_timeout = std::chrono::seconds(1);
+  const absl::Status s = RunFakes(behaviour);
+  EXPECT_TRUE(absl::IsDeadlineExceeded(s)) << s;
+  EXPECT_NE(s.message().find("1 servers did not end within 1 s"), std::string::npos) << s;
+  EXPECT_EQ(killed_, 1);
+}
+
+TEST_F(RunTest, OtherProtocolVersionIsRefusedWithBoth) {
+  FakeBehaviour behaviour;
+  behaviour.protocol_version = 7;
+  const absl::Status s = RunFakes(behaviour);
+  EXPECT_TRUE(absl::IsAborted(s)) << s;
+}
+
+TEST_F(RunTest, PortInUseIsSaid) {
+  grpc::ServerBuilder builder;
+  int port = 0;
+  builder.AddListeningPort("127.0.0.1:0", grpc::InsecureServerCredentials(), &port);
+  const std::unique_ptr<grpc::Server> other = builder.BuildAndStart();
+  options_.listen = "127.0.0.1:" + std::to_string(port);
+  const absl::Status s = RunFakes({});
+  EXPECT_TRUE(absl::IsUnavailable(s)) << s;
+  EXPECT_NE(s.message().find(options_.listen), std::string::npos) << s;
+}
+
+// A client that says things in the wrong order.
+class ServiceTest : public Test {
+ protected:
+  ServiceTest() : service_(Plan()) {
+    grpc::ServerBuilder builder;
+    int port = 0;
+    builder.AddListeningPort("127.0.0.1:0", grpc::InsecureServerCredentials(), &port);
+    builder.RegisterService(&service_);
+    server_ = builder.BuildAndStart();
+    stub_ = v1::Control::NewStub(
+        grpc::CreateChannel("127.0.0.1:" + std::to_string(port), grpc::InsecureChannelCredentials()));
+  }
+  ~ServiceTest() override { server_->Shutdown(std::chrono::system_clock::now()); }
+
+  static RunPlan Plan() {
+    RunPlan plan;
+    plan.tokens = {"a", "b"};
+    return plan;
+  }
+  static v1::FromRegion Hello(const std::string& token) {
+    v1::FromRegion m;
+    m.mutable_hello()->set_protocol_version(kControlProtocolVersion);
+    m.mutable_hello()->set_token(token);
+    m.mutable_hello()->set_endpoint("127.0.0.1:1");
+    return m;
+  }
+  // How the stream ends after these messages.
+  grpc::Status Say(const std::vector<v1::FromRegion>& messages) {
+    grpc::ClientContext context;
+    const auto stream = stub_->Join(&context);
+    for (const v1::FromRegion& m : messages) stream->Write(m);
+    v1::ToRegion answer;
+    while (stream->Read(&answer)) {
+    }
+    return stream->Finish();
+  }
+  ControlService service_;
+  std::unique_ptr<grpc::Server> server_;
+  std::unique_ptr<v1::Control::Stub> stub_;
+};
+
+TEST_F(ServiceTest, StrangeTokenIsRefused) {
+  const grpc::Status s = Say({Hello("c")});
+  EXPECT_EQ(s.error_code(), grpc::StatusCode::UNAUTHENTICATED);
+  EXPECT_EQ(s.error_message(), "hello.token: is not one of this run");
+  EXPECT_FALSE(service_.Status().regions[0].joined);
+}
+
+TEST_F(ServiceTest, TokenCountsOnce) {
+  grpc::ClientContext context;
+  const auto first = stub_->Join(&context);
+  first->Write(Hello("a"));
+  while (!service_.Status().regions[0].joined) service_.Wait(std::chrono::milliseconds(100));
+  EXPECT_EQ(Say({Hello("a")}).error_code(), grpc::StatusCode::ALREADY_EXISTS);
+  EXPECT_FALSE(service_.Status().regions[0].left);
+  context.TryCancel();
+  first->Finish();
+}
+
+TEST_F(ServiceTest, ReportBeforeHelloOrStartIsRefused) {
+  v1::FromRegion report;
+  report.mutable_report()->set_tick(1);
+  EXPECT_EQ(Say({report}).error_message(), "the first message must be a Hello");
+  EXPECT_EQ(Say({Hello("b"), report}).error_message(), "a Report before the Start, or after the last one");
+}
+
+TEST_F(ServiceTest, OldProtocolIsToldWhichOneIsSpoken) {
+  v1::FromRegion hello = Hello("a");
+  hello.mutable_hello()->set_protocol_version(9);
+  const grpc::Status s = Say({hello});
+  EXPECT_EQ(s.error_code(), grpc::StatusCode::FAILED_PRECONDITION);
+  EXPECT_NE(s.error_message().find("is 9, must be 1"), std::string::npos) << s.error_message();
+}
+
+}  // namespace
+}  // namespace aureole

@@ -1,0 +1,237 @@
+#include "tests/simulation/cluster.h"
+
+#include <algorithm>
+#include <map>
+#include <memory>
+
+#include <absl/strings/str_cat.h>
+
+#include "server/core/check.h"
+#include "server/core/region.h"
+#include "tests/simulation/network.h"
+
+namespace aureole::sim {
+namespace {
+
+class Run {
+ public:
+  Run(const Scenario& scenario, uint64_t seed, const Faults& faults, const EngineFactory& make_engine)
+      : s_(scenario),
+        world_(scenario.world),
+        faults_(faults),
+        rng_(seed ^ 0xfa17),
+        network_(world_.layout.size(), seed, faults),
+        reference_(make_engine(world_.environment)) {
+    for (const BodySpec& b : world_.bodies) reference_->Spawn(b);
+    for (const JointSpec& j : world_.joints) reference_->Join(j);
+    const int n = world_.layout.size();
+    stalled_.resize(n);
+    for (RegionId r = 0; r < n; ++r) {
+      regions_.push_back(std::make_unique<Region>(world_, r, make_engine(world_.environment)));
+    }
+  }
+
+  Verdict Go() {
+    for (RegionId r = 0; r < static_cast<int>(regions_.size()); ++r) RunRegion(r);
+    while (verdict_.ok && checked_ < s_.ticks) {
+      const bool more = network_.RunNext(
+          [this](RegionId to, const Frame& f) {
+            const absl::Status s = regions_[to]->Receive(f);
+            if (!s.ok()) Fail(f.tick, "receive", std::string(s.message()));
+            RunRegion(to);
+          },
+          [this](RegionId r) {
+            stalled_[r] = false;
+            RunRegion(r);
+          });
+      if (!more && checked_ < s_.ticks && verdict_.ok) Fail(checked_ + 1, "I5", "the regions wait for each other");
+    }
+    Summarize();
+    return verdict_;
+  }
+
+ private:
+  struct Tally {
+    int regions = 0;
+    std::vector<BodyRecord> records;
+  };
+
+  void RunRegion(RegionId r) {
+    Region& region = *regions_[r];
+    std::vector<Frame> out;
+    while (verdict_.ok && !stalled_[r] && region.Ready()) {
+      if (region.phase() == Phase::kBegin) {
+        if (region.tick() >= s_.ticks) return;
+        OfferLive(region);
+        if (faults_.stalls && rng_.Chance(0.01)) {
+          ++verdict_.stalls;
+          stalled_[r] = true;
+          network_.Wake(r, static_cast<int64_t>(rng_.In(1000, 100000)));
+          return;
+        }
+      }
+      const Tick before = region.tick();
+      if (region.phase() == Phase::kStep) Record(region, before + 1, &before_step_, &Run::CheckBeforeStep);
+      if (!verdict_.ok) return;
+      out.clear();
+      region.Advance(&out);
+      for (const Input& i : region.TakeAccepted()) accepted_[i.tick].push_back(i);
+      for (Frame& f : out) {
+        const auto frame = std::make_shared<const Frame>(std::move(f));
+        for (RegionId p : region.peers()) {
+          if (frame->to == p || frame->to == kEveryone) network_.Send(r, p, frame);
+        }
+      }
+      if (region.tick() > before) Record(region, region.tick(), &after_step_, &Run::CheckAfterStep);
+    }
+  }
+
+  // Live inputs are offered to each region until the owner takes them.
+  void OfferLive(Region& region) {
+    for (const Input& i : s_.live) {
+      if (i.tick > region.tick() || taken_[i.sequence]) continue;
+      if (region.Submit(i).ok()) {
+        taken_[i.sequence] = true;
+        ++verdict_.live_inputs;
+      }
+    }
+    for (const Input& i : region.TakeAccepted()) accepted_[i.tick].push_back(i);
+  }
+
+  void Record(const Region& region, Tick n, std::map<Tick, Tally>* tallies, void (Run::*check)(Tick, Tally&)) {
+    Tally& t = (*tallies)[n];
+    region.Observe(&t.records);
+    if (++t.regions < static_cast<int>(regions_.size())) return;
+    std::sort(t.records.begin(), t.records.end(), [](const BodyRecord& x, const BodyRecord& y) { return x.id < y.id; });
+    (this->*check)(n, t);
+    tallies->erase(n);
+  }
+
+  void Fail(Tick n, std::string invariant, std::string message) {
+    if (!verdict_.ok) return;
+    verdict_.ok = false;
+    verdict_.tick = n;
+    verdict_.invariant = std::move(invariant);
+    verdict_.message = std::move(message);
+  }
+
+  // I1, I2, I4 in the state in which everything stands when tick n is stepped.
+  void CheckBeforeStep(Tick n, Tally& t) {
+    StepReferenceInputs(n);
+    for (size_t i = 1; i < t.records.size(); ++i) {
+      const BodyRecord &a = t.records[i - 1], &b = t.records[i];
+      if (a.id == b.id) return Fail(n, "I1", absl::StrCat("body ", a.id, " is in groups ", a.group, " and ", b.group));
+    }
+    const std::vector<BodyId> ids = reference_->Ids();
+    for (size_t i = 0; i < std::max(ids.size(), t.records.size()); ++i) {
+      if (i < ids.size() && (i >= t.records.size() || t.records[i].id > ids[i])) {
+        return Fail(n, "I2", absl::StrCat("body ", ids[i], " is nowhere"));
+      }
+      if (i >= ids.size() || t.records[i].id < ids[i]) {
+        return Fail(n, "I2", absl::StrCat("body ", t.records[i].id, " should not be"));
+      }
+    }
+    CheckCohosting(n, t);
+    for (const BodyRecord& r : t.records) {
+      auto [it, fresh] = groups_.emplace(r.id, r.group);
+      it->second = r.group;
+    }
+    for (const JointSpec& j : world_.joints) {
+      if (j.b == 0 || !reference_->Contains(j.a) || !reference_->Contains(j.b)) continue;
+      if (groups_.at(j.a) != groups_.at(j.b)) {
+        return Fail(n, "I4", absl::StrCat("jointed bodies ", j.a, " and ", j.b, " are stepped apart"));
+      }
+    }
+    for (const BodyRecord& r : t.records) asleep_[r.id] = reference_->View(r.id).asleep;
+    reference_->Step(n);
+    for (const BodyRecord& r : t.records) verdict_.wakes += asleep_[r.id] && !reference_->View(r.id).asleep;
+  }
+
+  void CheckCohosting(Tick n, const Tally& t) {
+    std::vector<const BodyRecord*> by_x;
+    for (const BodyRecord& r : t.records) by_x.push_back(&r);
+    std::sort(by_x.begin(), by_x.end(),
+              [](const BodyRecord* x, const BodyRecord* y) { return x->box.min.x() < y->box.min.x(); });
+    for (size_t i = 0; i < by_x.size(); ++i) {
+      for (size_t j = i + 1; j < by_x.size() && by_x[j]->box.min.x() <= by_x[i]->box.max.x(); ++j) {
+        if (by_x[i]->group == by_x[j]->group || !Overlap(by_x[i]->box, by_x[j]->box)) continue;
+        return Fail(n, "I4",
+                    absl::StrCat("bodies ", by_x[i]->id, " (group ", by_x[i]->group, ") and ", by_x[j]->id, " (group ",
+                                 by_x[j]->group, ") overlap and are stepped apart"));
+      }
+    }
+  }
+
+  // I3 and I6 in state n.
+  void CheckAfterStep(Tick n, Tally& t) {
+    verdict_.hash = 0;
+    for (const BodyRecord& r : t.records) {
+      auto [it, fresh] = epochs_.emplace(r.id, r.epoch);
+      if (r.epoch < it->second) {
+        return Fail(n, "I3", absl::StrCat("body ", r.id, " went from epoch ", it->second, " to ", r.epoch));
+      }
+      it->second = r.epoch;
+      if (!reference_->Contains(r.id)) return Fail(n, "I2", absl::StrCat("body ", r.id, " should not be"));
+      if (reference_->Hash(r.id) != r.hash) {
+        return Fail(n, "I6", absl::StrCat("body ", r.id, " in group ", r.group, " differs from the undivided world"));
+      }
+      verdict_.hash += BodyHash(r.id, r.hash);
+    }
+    verdict_.body_ticks += static_cast<int64_t>(t.records.size());
+    checked_ = n;
+  }
+
+  void StepReferenceInputs(Tick n) {
+    std::vector<Input> inputs;
+    ScriptedInputs(world_, n, &inputs);
+    auto& accepted = accepted_[n];
+    std::sort(accepted.begin(), accepted.end());
+    inputs.insert(inputs.end(), accepted.begin(), accepted.end());
+    for (const Input& i : inputs) {
+      if (i.kind == Input::Kind::kSpawn) ++verdict_.spawns;
+      if (i.kind == Input::Kind::kSpawn || reference_->Contains(i.body)) reference_->Apply(i);
+    }
+  }
+
+  void Summarize() {
+    verdict_.reconnects = network_.reconnects();
+    verdict_.duplicates = network_.duplicates();
+    for (const auto& r : regions_) {
+      const RegionStats& x = r->stats();
+      verdict_.transfers += x.transfers_out;
+      verdict_.touching_transfers += x.touching_out;
+      verdict_.bodies_moved += x.bodies_out;
+      verdict_.returns += x.returns_out;
+      verdict_.largest_cluster = std::max(verdict_.largest_cluster, x.largest_cluster);
+      verdict_.longest_chain = std::max(verdict_.longest_chain, x.longest_chain);
+      verdict_.violations += x.violations;
+      verdict_.crossings += x.crossings;
+      verdict_.home_crossings += x.home_crossings;
+    }
+  }
+
+  const Scenario& s_;
+  const World& world_;
+  const Faults faults_;
+  Random rng_;
+  Network network_;
+  std::unique_ptr<Engine> reference_;
+  std::vector<std::unique_ptr<Region>> regions_;
+  std::vector<bool> stalled_;
+  std::map<Tick, Tally> before_step_, after_step_;
+  std::map<Tick, std::vector<Input>> accepted_;
+  std::map<uint64_t, bool> taken_;
+  std::map<BodyId, int64_t> groups_;
+  std::map<BodyId, bool> asleep_;
+  std::map<BodyId, Epoch> epochs_;
+  Tick checked_ = 0;
+  Verdict verdict_;
+};
+
+}  // namespace
+
+Verdict RunCluster(const Scenario& scenario, uint64_t seed, const Faults& faults, const EngineFactory& make_engine) {
+  return Run(scenario, seed, faults, make_engine).Go();
+}
+
+}  // namespace aureole::sim

@@ -1,0 +1,42 @@
+// The cluster simulation: many regions in one thread, joined by a seeded network, checked against the undivided world
+// after every tick (DESIGN.md section 5). The undivided reference is the engine without any aura code.
+#pragma once
+
+#include <cstdint>
+#include <string>
+
+#include "tests/simulation/scenario.h"
+
+namespace aureole::sim {
+
+// What the network may do. Nothing of it may change a bit.
+struct Faults {
+  bool delay = true;  // up to 20 ms a frame, per link
+  bool jitter = true;
+  bool duplicates = true;
+  bool reconnects = true;  // a connection is cut: what is under way is lost, the next one resumes
+  bool stalls = true;      // a region stops for up to 100 ms
+
+  static Faults None() { return {false, false, false, false, false}; }
+};
+
+struct Verdict {
+  bool ok = true;
+  Tick tick = 0;          // first bad tick
+  std::string invariant;  // "I1".. "I6", "live"
+  std::string message;
+
+  // What the seed went through.
+  int64_t transfers = 0, touching_transfers = 0, bodies_moved = 0, returns = 0;
+  int64_t wakes = 0;
+  int64_t largest_cluster = 0, longest_chain = 0;
+  int64_t spawns = 0, live_inputs = 0;
+  int64_t reconnects = 0, duplicates = 0, stalls = 0;
+  int64_t violations = 0, crossings = 0;
+  int64_t home_crossings = 0, away_body_ticks = 0, body_ticks = 0;
+  uint64_t hash = 0;  // of the last state
+};
+
+Verdict RunCluster(const Scenario& scenario, uint64_t seed, const Faults& faults, const EngineFactory& make_engine);
+
+}  // namespace aureole::sim

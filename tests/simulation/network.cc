@@ -1,0 +1,81 @@
+#include "tests/simulation/network.h"
+
+namespace aureole::sim {
+
+Network::Network(int regions, uint64_t seed, const Faults& faults) : faults_(faults), rng_(seed ^ 0x5eed) {
+  for (RegionId a = 0; a < regions; ++a) {
+    for (RegionId b = 0; b < regions; ++b) {
+      if (a != b) links_[{a, b}].base_us = faults_.delay ? static_cast<int64_t>(rng_.In(100, 20000)) : 100;
+    }
+  }
+}
+
+void Network::Push(Event e) {
+  e.order = ++order_;
+  events_.push(std::move(e));
+}
+
+void Network::Send(RegionId from, RegionId to, std::shared_ptr<const Frame> frame) {
+  Link& link = links_.at({from, to});
+  const uint64_t sequence = link.sender.Push(frame);
+  Transmit(from, to, sequence, frame);
+  if (faults_.duplicates && rng_.Chance(0.03)) {
+    ++duplicates_;
+    Transmit(from, to, sequence, frame);
+  }
+  if (faults_.reconnects && rng_.Chance(0.01)) {
+    ++reconnects_;
+    ++link.connection;
+    Push({now_us_ + static_cast<int64_t>(rng_.In(0, 50000)), 0, Event::Kind::kReconnect, from, to, link.connection, 0,
+          nullptr});
+  }
+}
+
+void Network::Transmit(RegionId from, RegionId to, uint64_t sequence, const std::shared_ptr<const Frame>& frame) {
+  Link& link = links_.at({from, to});
+  int64_t at = now_us_ + link.base_us;
+  if (faults_.jitter) at += static_cast<int64_t>(rng_.In(0, rng_.Chance(0.05) ? 60000 : 3000));
+  // A connection keeps its order.
+  link.last_arrival_us = at = std::max(at, link.last_arrival_us);
+  Push({at, 0, Event::Kind::kFrame, from, to, link.connection, sequence, frame});
+}
+
+void Network::Wake(RegionId region, int64_t delay_us) {
+  Push({now_us_ + delay_us, 0, Event::Kind::kWake, region, region, 0, 0, nullptr});
+}
+
+bool Network::RunNext(const std::function<void(RegionId, const Frame&)>& deliver,
+                      const std::function<void(RegionId)>& wake) {
+  if (events_.empty()) return false;
+  const Event e = events_.top();
+  events_.pop();
+  now_us_ = e.at_us;
+  if (e.kind == Event::Kind::kWake) {
+    wake(e.to);
+    return true;
+  }
+  Link& link = links_.at({e.from, e.to});
+  if (e.connection != link.connection) return true;  // lost with its connection
+  if (e.kind == Event::Kind::kReconnect) {
+    link.last_arrival_us = now_us_;
+    link.sender.Resume(link.receiver.applied(), [&](uint64_t sequence, const std::shared_ptr<const Frame>& frame) {
+      Transmit(e.from, e.to, sequence, frame);
+    });
+    return true;
+  }
+  switch (link.receiver.Check(e.sequence)) {
+    case LinkReceiver::Verdict::kApply:
+      deliver(e.to, *e.frame);
+      // The acknowledgement may take its time: what is kept too long does no harm.
+      if (rng_.Chance(0.5)) link.sender.Acknowledge(link.receiver.applied());
+      break;
+    case LinkReceiver::Verdict::kDuplicate:
+      break;
+    case LinkReceiver::Verdict::kGap:
+      // Frames sent between the cut and the reconnect went into the new connection before its resume.
+      break;
+  }
+  return true;
+}
+
+}  // namespace aureole::sim

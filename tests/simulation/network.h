@@ -1,0 +1,62 @@
+// A seeded network between regions, in virtual time: every link loses connections and repeats messages, and LinkSender
+// and LinkReceiver make exactly-once, in-order delivery of it.
+#pragma once
+
+#include <functional>
+#include <map>
+#include <memory>
+#include <queue>
+#include <vector>
+
+#include "server/core/frame.h"
+#include "server/core/link.h"
+#include "tests/simulation/cluster.h"
+#include "tests/simulation/random.h"
+
+namespace aureole::sim {
+
+class Network {
+ public:
+  Network(int regions, uint64_t seed, const Faults& faults);
+
+  void Send(RegionId from, RegionId to, std::shared_ptr<const Frame> frame);
+  // Runs `fn` for the region at a later time of its own choosing.
+  void Wake(RegionId region, int64_t delay_us);
+  // Delivers the next event. `deliver` gets frames; `wake` gets regions that were stalled. False when nothing is under
+  // way.
+  bool RunNext(const std::function<void(RegionId to, const Frame&)>& deliver,
+               const std::function<void(RegionId)>& wake);
+
+  int64_t reconnects() const { return reconnects_; }
+  int64_t duplicates() const { return duplicates_; }
+
+ private:
+  struct Link {
+    LinkSender<std::shared_ptr<const Frame>> sender;
+    LinkReceiver receiver;
+    uint64_t connection = 0;
+    int64_t base_us = 0, last_arrival_us = 0;
+  };
+  struct Event {
+    int64_t at_us;
+    uint64_t order;
+    enum class Kind { kFrame, kReconnect, kWake } kind;
+    RegionId from, to;
+    uint64_t connection, sequence;
+    std::shared_ptr<const Frame> frame;
+    bool operator>(const Event& o) const { return at_us != o.at_us ? at_us > o.at_us : order > o.order; }
+  };
+
+  void Transmit(RegionId from, RegionId to, uint64_t sequence, const std::shared_ptr<const Frame>& frame);
+  void Push(Event e);
+
+  Faults faults_;
+  Random rng_;
+  std::map<std::pair<RegionId, RegionId>, Link> links_;
+  std::priority_queue<Event, std::vector<Event>, std::greater<>> events_;
+  int64_t now_us_ = 0;
+  uint64_t order_ = 0;
+  int64_t reconnects_ = 0, duplicates_ = 0;
+};
+
+}  // namespace aureole::sim

@@ -1,0 +1,90 @@
+// The slice of the cluster simulation that every test run includes.
+#include <gtest/gtest.h>
+
+#include "server/core/toy_engine.h"
+#include "tests/simulation/cluster.h"
+
+namespace aureole::sim {
+namespace {
+
+// Runs seeds until one is bad; adds up what they went through.
+struct Sum {
+  int64_t bad = 0, touching = 0, chains_of_3 = 0, chains_of_4 = 0, wakes = 0, returns = 0, reconnects = 0;
+  std::string first;
+};
+Sum RunSeeds(uint64_t first, int seeds, const ScenarioOptions& options, const Faults& faults, bool stop = true) {
+  Sum sum;
+  for (uint64_t seed = first; seed < first + static_cast<uint64_t>(seeds); ++seed) {
+    const Scenario s = MakeScenario(seed, options, MakeToyEngine);
+    const Verdict v = RunCluster(s, seed, faults, MakeToyEngine);
+    sum.bad += !v.ok;
+    sum.touching += v.touching_transfers;
+    sum.chains_of_3 += v.longest_chain >= 3;
+    sum.chains_of_4 += v.longest_chain >= 4;
+    sum.wakes += v.wakes;
+    sum.returns += v.returns;
+    sum.reconnects += v.reconnects;
+    if (!v.ok) {
+      sum.first =
+          "seed " + std::to_string(seed) + " tick " + std::to_string(v.tick) + " " + v.invariant + ": " + v.message;
+      if (stop) break;
+    }
+  }
+  return sum;
+}
+
+TEST(ClusterSimulation, InvariantsHoldWithEveryDelayUnderAllFaults) {
+  const Sum sum = RunSeeds(1, 1500, {}, Faults());
+  EXPECT_EQ(sum.bad, 0) << sum.first;
+  // An easy world is no proof.
+  EXPECT_GT(sum.touching, 1500);
+  EXPECT_GT(sum.chains_of_3, 50);
+  EXPECT_GT(sum.wakes, 500);
+  EXPECT_GT(sum.returns, 1500);
+  EXPECT_GT(sum.reconnects, 500);
+}
+
+TEST(ClusterSimulation, CornersAndNarrowCellsHoldInTheSynchronousExchange) {
+  ScenarioOptions options;
+  options.k = 0;
+  for (const char* layout : {"tee", "grid4", "grid9", "bricks"}) {
+    options.layout = layout;
+    const Sum sum = RunSeeds(5000, 300, options, Faults::None());
+    EXPECT_EQ(sum.bad, 0) << layout << ": " << sum.first;
+    EXPECT_GT(sum.chains_of_3, 10) << layout;
+  }
+}
+
+TEST(ClusterSimulation, TheNetworkChangesNoBit) {
+  for (uint64_t seed = 1; seed <= 60; ++seed) {
+    const Scenario s = MakeScenario(seed, {}, MakeToyEngine);
+    if (!s.live.empty()) continue;  // a live input takes effect when it arrives
+    const Verdict calm = RunCluster(s, seed, Faults::None(), MakeToyEngine);
+    const Verdict rough = RunCluster(s, seed, Faults(), MakeToyEngine);
+    EXPECT_EQ(calm.hash, rough.hash) << "seed " << seed;
+    EXPECT_EQ(calm.transfers, rough.transfers) << "seed " << seed;
+  }
+}
+
+// Seeds on which something once went wrong.
+TEST(ClusterSimulation, OldFaultsStayMended) {
+  struct Old {
+    uint64_t seed;
+    int k;
+    const char* why;
+  };
+  for (const Old& old :
+       {Old{3662, 2, "a spawn that was sent before it took effect"},
+        Old{1879, 2, "spawn notice 3k-1 is too short where three regions meet"}, Old{1879, 3, "the same"},
+        Old{1321, 3, "the same"}, Old{5062, 1, "strangers of two regions meet deep in a third: m = 3 on columns"},
+        Old{1486, 1, "the same"}, Old{1796, 1, "the same"}}) {
+    ScenarioOptions options;
+    options.k = old.k;
+    options.policy = AuraPolicy::kTolerance;
+    const Sum sum = RunSeeds(old.seed, 1, options, Faults());
+    EXPECT_EQ(sum.bad, 0) << old.why << ": " << sum.first;
+  }
+}
+
+}  // namespace
+}  // namespace aureole::sim

@@ -1,0 +1,252 @@
+// Frames survive the wire bit for bit, cost what the bars allow, and nothing malformed gets through.
+#include "server/transport/frame_codec.h"
+
+#include <gtest/gtest.h>
+
+#include <cmath>
+#include <limits>
+#include <random>
+
+#include "aureole/v1/peer.pb.h"
+#include "server/transport/link_limits.h"
+
+namespace aureole {
+namespace {
+
+Aura MakeAura(BodyId id, bool predicted) {
+  Aura a;
+  a.id = id;
+  const float x = static_cast<float>(id % 1000) * 0.37f - 100;
+  a.box = {{x, 0.1f, -3}, {x + 0.6f, 0.7f, -2.4f}};
+  if (predicted) {
+    a.owner = static_cast<RegionId>(id % 3);
+    a.velocity[0] = 1.5f;
+    a.velocity[1] = -0.0f;
+    a.velocity[2] = std::numeric_limits<float>::denorm_min();
+    a.speed = 3.25f;
+    a.asleep = id % 2 == 0;
+  }
+  return a;
+}
+
+Frame MakeFrame(bool predicted) {
+  Frame f;
+  f.from = 1;
+  f.to = 2;
+  f.tick = 123456;
+  f.round = predicted ? 0 : 2;
+  for (BodyId id : {7ull, 9ull, 1ull << 62, ~0ull, 3ull}) f.auras.push_back(MakeAura(id, predicted));
+  f.gone = {5, ~0ull, 2};
+  f.edges = {{1, ~0ull}, {7, 9}, {2, 3}};
+  f.fragments.push_back({{4, 8, 15}, 2, 9, {{0, 12.5}, {3, 0.1}}, kNoRegion});
+  f.fragments.push_back({{1ull << 63}, 1, 1, {}, 4});
+  Transfer t;
+  t.ids = {11, 1ull << 62};
+  t.epochs = {0, 4000000000u};
+  t.cause = TransferCause::kBoundaryTraverse;
+  t.state = std::string("\0\1\2 state", 9);
+  Input input;
+  input.tick = 123460;
+  input.source = 4;
+  input.sequence = 17;
+  input.kind = Input::Kind::kVelocity;
+  input.body = 11;
+  input.linear = {0.1, -0.0, 1e-300};
+  input.angular = {1, 2, 3};
+  t.pending = {input};
+  f.transfers = {t, t};
+  if (predicted) {
+    f.away = {{21, 3, MakeAura(21, false).box}, {20, kNoRegion, MakeAura(20, false).box}};
+    f.away_gone = {30, 29};
+  }
+  return f;
+}
+
+bool SameBits(const Vec3& a, const Vec3& b) { return std::memcmp(a.data(), b.data(), 3 * sizeof(double)) == 0; }
+
+void ExpectSame(const Frame& a, const Frame& b) {
+  EXPECT_EQ(a.tick, b.tick);
+  EXPECT_EQ(a.round, b.round);
+  ASSERT_EQ(a.auras.size(), b.auras.size());
+  for (size_t i = 0; i < a.auras.size(); ++i) {
+    EXPECT_EQ(a.auras[i], b.auras[i]);
+    EXPECT_EQ(std::memcmp(a.auras[i].velocity, b.auras[i].velocity, sizeof(a.auras[i].velocity)), 0);
+  }
+  EXPECT_EQ(a.gone, b.gone);
+  EXPECT_EQ(a.edges, b.edges);
+  ASSERT_EQ(a.fragments.size(), b.fragments.size());
+  for (size_t i = 0; i < a.fragments.size(); ++i) {
+    EXPECT_EQ(a.fragments[i].known, b.fragments[i].known);
+    EXPECT_EQ(a.fragments[i].id, b.fragments[i].id);
+    EXPECT_EQ(a.fragments[i].bodies, b.fragments[i].bodies);
+    EXPECT_EQ(a.fragments[i].mass_by_home, b.fragments[i].mass_by_home);
+    EXPECT_EQ(a.fragments[i].gives_back, b.fragments[i].gives_back);
+  }
+  ASSERT_EQ(a.transfers.size(), b.transfers.size());
+  for (size_t i = 0; i < a.transfers.size(); ++i) {
+    const Transfer &x = a.transfers[i], &y = b.transfers[i];
+    EXPECT_EQ(x.ids, y.ids);
+    EXPECT_EQ(x.epochs, y.epochs);
+    EXPECT_EQ(x.cause, y.cause);
+    EXPECT_EQ(x.state, y.state);
+    ASSERT_EQ(x.pending.size(), y.pending.size());
+    for (size_t j = 0; j < x.pending.size(); ++j) {
+      const Input &p = x.pending[j], &q = y.pending[j];
+      EXPECT_EQ(std::tie(p.tick, p.source, p.sequence, p.kind, p.body),
+                std::tie(q.tick, q.source, q.sequence, q.kind, q.body));
+      EXPECT_TRUE(SameBits(p.linear, q.linear) && SameBits(p.angular, q.angular));
+    }
+  }
+  EXPECT_EQ(a.away, b.away);
+  EXPECT_EQ(a.away_gone, b.away_gone);
+}
+
+absl::Status Refusal(const v1::Frame& frame) { return DecodeFrame(frame.SerializeAsString(), 0, 1).status(); }
+
+v1::Frame Parsed(const Frame& frame) {
+  v1::Frame out;
+  EXPECT_TRUE(out.ParseFromString(EncodeFrame(frame)));
+  return out;
+}
+
+TEST(FrameCodec, FrameSurvivesBitForBit) {
+  for (bool predicted : {false, true}) {
+    const Frame frame = MakeFrame(predicted);
+    const absl::StatusOr<Frame> back = DecodeFrame(EncodeFrame(frame), frame.from, frame.to);
+    ASSERT_TRUE(back.ok()) << back.status();
+    EXPECT_EQ(back->from, 1);
+    EXPECT_EQ(back->to, 2);
+    ExpectSame(frame, *back);
+  }
+}
+
+TEST(FrameCodec, EncodingDoesNotDependOnTheReceiver) {
+  Frame a = MakeFrame(false), b = a;
+  b.to = kEveryone;
+  EXPECT_EQ(EncodeFrame(a), EncodeFrame(b));
+}
+
+TEST(FrameCodec, AuraUpdateCostsAtMostSixtyBytes) {
+  for (bool predicted : {false, true}) {
+    Frame with, without;
+    with.tick = without.tick = 1000000;
+    // Ids far apart: the dearest delta.
+    for (BodyId id = 1; id <= 100; ++id) with.auras.push_back(MakeAura(id * 0x9E3779B97F4A7C15ull, predicted));
+    const double bytes = static_cast<double>(EncodeFrame(with).size() - EncodeFrame(without).size()) / 100;
+    EXPECT_LE(bytes, static_cast<double>(kMaxAuraBytes));
+    RecordProperty(predicted ? "bytes_predicted" : "bytes", std::to_string(bytes));
+    Frame one;
+    one.tick = without.tick;
+    one.auras.push_back(MakeAura(~0ull / 3, predicted));
+    EXPECT_LE(EncodeFrame(one).size() - EncodeFrame(without).size(), kMaxAuraBytes + 8);  // and the columns' headers
+  }
+}
+
+TEST(FrameCodec, EmptyFrameIsThePhaseAlone) {
+  Frame frame;
+  frame.tick = 60 * 60 * 24 * 60;  // a day at 60 Hz
+  frame.round = 1;
+  EXPECT_LE(EncodeFrame(frame).size(), 5u);
+}
+
+TEST(FrameCodec, RefusesWhatNoRegionSends) {
+  const auto refused = [](const char* field, auto change) {
+    v1::Frame frame = Parsed(MakeFrame(true));
+    change(&frame);
+    const absl::Status s = Refusal(frame);
+    EXPECT_EQ(s.code(), absl::StatusCode::kInvalidArgument) << field;
+    EXPECT_NE(std::string(s.message()).find(field), std::string::npos) << field << ": " << s.message();
+  };
+  EXPECT_TRUE(Refusal(Parsed(MakeFrame(true))).ok());
+  refused("frame.phase", [](v1::Frame* f) { f->set_phase(7); });
+  refused("frame.aura_id", [](v1::Frame* f) { f->set_aura_id(0, 0); });
+  refused("frame.aura_box", [](v1::Frame* f) { f->add_aura_box(1); });
+  refused("frame.aura_box", [](v1::Frame* f) { f->set_aura_box(0, 1e9f); });
+  refused("frame.aura_box", [](v1::Frame* f) { f->set_aura_box(4, std::nanf("")); });
+  refused("frame.aura_owner", [](v1::Frame* f) { f->set_aura_owner(0, kMaxRegions + 1); });
+  refused("frame.aura_owner", [](v1::Frame* f) { f->add_aura_owner(1); });
+  refused("frame.aura_velocity", [](v1::Frame* f) { f->set_aura_velocity(0, INFINITY); });
+  refused("frame.aura_speed", [](v1::Frame* f) { f->set_aura_speed(0, -1); });
+  refused("frame.aura_asleep", [](v1::Frame* f) { f->add_aura_asleep(true); });
+  refused("frame.gone_id", [](v1::Frame* f) { f->set_gone_id(0, 0); });
+  refused("frame.edge_step", [](v1::Frame* f) { f->set_edge_step(0, 0); });
+  refused("frame.edge_step", [](v1::Frame* f) { f->add_edge_step(1); });
+  refused("frame.fragment.known", [](v1::Frame* f) { f->mutable_fragment(0)->clear_known(); });
+  refused("frame.fragment.known", [](v1::Frame* f) { f->mutable_fragment(0)->set_known(1, -1); });
+  refused("frame.fragment.id", [](v1::Frame* f) { f->mutable_fragment(0)->set_id(5); });
+  refused("frame.fragment.bodies", [](v1::Frame* f) { f->mutable_fragment(0)->set_bodies(2); });
+  refused("frame.fragment.home", [](v1::Frame* f) { f->mutable_fragment(0)->set_home(1, 0); });
+  refused("frame.fragment.mass", [](v1::Frame* f) { f->mutable_fragment(0)->set_mass(1, -1); });
+  refused("frame.fragment.gives_back", [](v1::Frame* f) { f->mutable_fragment(1)->set_gives_back(1u << 31); });
+  refused("frame.transfer.id", [](v1::Frame* f) { f->mutable_transfer(0)->set_id(1, 0); });
+  refused("frame.transfer.epoch", [](v1::Frame* f) { f->mutable_transfer(0)->add_epoch(1); });
+  refused("frame.transfer.cause", [](v1::Frame* f) { f->mutable_transfer(0)->set_cause(4); });
+  refused("frame.transfer.state", [](v1::Frame* f) { f->mutable_transfer(0)->clear_state(); });
+  refused("frame.transfer.pending.kind", [](v1::Frame* f) { f->mutable_transfer(0)->mutable_pending(0)->set_kind(1); });
+  refused("frame.transfer.pending.linear",
+          [](v1::Frame* f) { f->mutable_transfer(0)->mutable_pending(0)->set_linear(1, NAN); });
+  refused("frame.away_owner", [](v1::Frame* f) { f->set_away_owner(1, kMaxRegions + 1); });
+  refused("frame.away_box", [](v1::Frame* f) { f->add_away_box(1); });
+  refused("frame.away_gone_id", [](v1::Frame* f) { f->set_away_gone_id(0, 0); });
+  refused("does not know", [](v1::Frame* f) {
+    f->mutable_transfer(0)->GetReflection()->MutableUnknownFields(f->mutable_transfer(0))->AddVarint(99, 1);
+  });
+}
+
+TEST(FrameCodec, RefusesMoreThanTheLimits) {
+  v1::Frame frame;
+  for (size_t i = 0; i <= kMaxTransfers; ++i) frame.add_transfer();
+  EXPECT_EQ(Refusal(frame).code(), absl::StatusCode::kInvalidArgument);
+  EXPECT_EQ(DecodeFrame(std::string(kMaxFrameBytes + 1, 'x'), 0, 1).status().code(),
+            absl::StatusCode::kInvalidArgument);
+}
+
+// Whatever decodes must be a frame that encodes and decodes again to the same; nothing may crash or read past the end.
+void ExpectHarmless(const std::string& bytes) {
+  const absl::StatusOr<Frame> frame = DecodeFrame(bytes, 0, 1);
+  if (!frame.ok()) {
+    EXPECT_EQ(frame.status().code(), absl::StatusCode::kInvalidArgument);
+    EXPECT_EQ(std::string(frame.status().message()).rfind("frame", 0), 0u) << frame.status().message();
+    return;
+  }
+  const absl::StatusOr<Frame> again = DecodeFrame(EncodeFrame(*frame), 0, 1);
+  ASSERT_TRUE(again.ok()) << again.status();
+  ExpectSame(*frame, *again);
+}
+
+TEST(FrameCodec, DamagedBytesAreRefusedOrHarmless) {
+  std::mt19937_64 random(1);
+  int refused = 0;
+  const std::string good[2] = {EncodeFrame(MakeFrame(false)), EncodeFrame(MakeFrame(true))};
+  for (int n = 0; n < 20000; ++n) {
+    std::string bytes = good[n % 2];
+    switch (n / 2 % 4) {
+      case 0:
+        for (uint64_t flips = 1 + random() % 4; flips > 0; --flips) {
+          bytes[random() % bytes.size()] ^= static_cast<char>(1 << random() % 8);
+        }
+        break;
+      case 1:
+        bytes.resize(random() % bytes.size());
+        break;
+      case 2:  // a huge count or length
+        bytes.replace(random() % bytes.size(), 1, "\xff\xff\xff\xff\x7f");
+        break;
+      default:
+        bytes.resize(random() % 200);
+        for (char& c : bytes) c = static_cast<char>(random());
+    }
+    ExpectHarmless(bytes);
+    refused += !DecodeFrame(bytes, 0, 1).ok();
+  }
+  EXPECT_GT(refused, 10000);
+}
+
+TEST(FrameCodecDeathTest, PendingSpawnStopsTheProcess) {
+  Frame frame = MakeFrame(false);
+  frame.transfers[0].pending[0].kind = Input::Kind::kSpawn;
+  EXPECT_DEATH(EncodeFrame(frame), "pending spawn in the transfer of body 11");
+}
+
+}  // namespace
+}  // namespace aureole

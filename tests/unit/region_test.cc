@@ -1,0 +1,128 @@
+#include "server/core/region.h"
+
+#include <array>
+
+#include <gmock/gmock.h>
+#include <gtest/gtest.h>
+
+#include "tests/simulation/lockstep.h"
+
+namespace aureole {
+namespace {
+
+using sim::Lockstep;
+using testing::HasSubstr;
+
+BodySpec Ball(BodyId id, double x, double vx = 0, bool asleep = false) {
+  auto shape = std::make_shared<Shape>();
+  shape->radius = 0.3;
+  BodySpec b;
+  b.id = id;
+  b.shape = shape;
+  b.position = {x, 0, 0};
+  b.velocity = {vx, 0, 0};
+  b.asleep = asleep;
+  return b;
+}
+
+World TwoColumns() {
+  World w(*Layout::Columns(std::array{0.0}));
+  w.environment.gravity = Vec3::Zero();
+  return w;
+}
+
+int64_t AurasSent(Lockstep& s) { return s.region(0).stats().auras_sent + s.region(1).stats().auras_sent; }
+
+TEST(Region, BodyFarFromTheBorderCostsNoAuraTestAndNoByte) {
+  World w = TwoColumns();
+  for (BodyId id = 1; id <= 50; ++id) w.bodies.push_back(Ball(id, -100.0 - static_cast<double>(id), 0.5));
+  Lockstep s(w);
+  s.RunTo(100);
+  EXPECT_EQ(s.region(0).stats().aura_tests, 0);
+  EXPECT_EQ(AurasSent(s), 0);
+  for (const Frame& f : s.LastFrames()) {
+    EXPECT_TRUE(f.auras.empty() && f.gone.empty() && f.edges.empty() && f.fragments.empty() && f.transfers.empty());
+  }
+}
+
+TEST(Region, SleepingBodyOnTheBorderIsToldOnce) {
+  World w = TwoColumns();
+  w.bodies = {Ball(1, -0.1, 0, true)};
+  Lockstep s(w);
+  s.RunTo(1);
+  EXPECT_EQ(AurasSent(s), 1);
+  s.RunTo(200);
+  EXPECT_EQ(AurasSent(s), 1);
+  EXPECT_EQ(s.region(0).stats().auras_told, 1) << "and the peer still holds it";
+}
+
+TEST(Region, JointedBodiesNeverHaveTwoOwners) {
+  World w = TwoColumns();
+  w.bodies = {Ball(1, -3, 5), Ball(2, -2, 5)};
+  JointSpec j;
+  j.id = 1;
+  j.a = 1;
+  j.b = 2;
+  w.joints = {j};
+  Lockstep s(w);
+  for (Tick n = 1; n <= 100; ++n) {
+    s.RunTo(n);
+    ASSERT_EQ(s.Owner(1), s.Owner(2)) << "tick " << n;
+  }
+  EXPECT_EQ(s.Owner(1), 1) << "they must have crossed";
+}
+
+TEST(Region, BodyThatWentHomeDoesNotComeBackAtOnce) {
+  // It swings over the border; the dwell keeps it from changing owner with every swing.
+  World w = TwoColumns();
+  w.bodies = {Ball(1, -2, 8)};
+  Lockstep s(w);
+  s.RunTo(60);
+  EXPECT_EQ(s.Owner(1), 1);
+  EXPECT_EQ(s.BodiesMoved(), 1);
+}
+
+TEST(Region, FrameOfAStrangerIsRefusedWithAReasonAndChangesNothing) {
+  Lockstep s(TwoColumns());
+  s.RunTo(3);
+  const uint64_t hash = s.Hash();
+  Frame f;
+  f.from = 7;
+  f.to = 0;
+  EXPECT_THAT(std::string(s.region(0).Receive(f).message()), HasSubstr("frame.from: 7 is no peer"));
+  f.from = 1;
+  f.to = 1;
+  EXPECT_THAT(std::string(s.region(0).Receive(f).message()), HasSubstr("frame.to"));
+  f.to = 0;
+  f.tick = 9;
+  EXPECT_THAT(std::string(s.region(0).Receive(f).message()), HasSubstr("cannot follow"));
+  f.tick = 4;
+  Aura a;
+  a.id = 5;
+  a.box.min[0] = 2;
+  f.auras = {a};
+  EXPECT_THAT(std::string(s.region(0).Receive(f).message()), HasSubstr("frame.auras.box"));
+  s.RunTo(4);
+  EXPECT_EQ(s.Hash(), hash);
+}
+
+TEST(Region, LiveInputTakesEffectInTheNextTickAndElsewhereNamesTheOwner) {
+  World w = TwoColumns();
+  w.bodies = {Ball(1, -5)};
+  Lockstep s(w);
+  s.RunTo(10);
+  Input kick;
+  kick.kind = Input::Kind::kImpulse;
+  kick.source = 1;
+  kick.sequence = 1;
+  kick.body = 1;
+  kick.linear = {3, 0, 0};
+  EXPECT_THAT(std::string(s.region(1).Submit(kick).status().message()), HasSubstr("is not in region 1"));
+  ASSERT_EQ(*s.region(0).Submit(kick), 11);
+  s.RunTo(11);
+  EXPECT_DOUBLE_EQ(s.region(0).engine().View(1).velocity.x(), 3.0);
+  EXPECT_EQ(s.region(0).TakeAccepted().size(), 1u);
+}
+
+}  // namespace
+}  // namespace aureole
