@@ -62,8 +62,8 @@ const char* Name(Stage stage) {
 std::string TableRow(const std::string& name, Tick tick, double factor, int64_t bodies, int64_t awake,
                      const v1::FrameTime& frame, int64_t auras, int64_t transfers, double bytes_per_second,
                      int64_t waits, int64_t wait_us, int64_t violations) {
-  return absl::StrFormat("%-7s %9d %6.2f %7d %7d %7d %8.2f %8.2f %8.2f %7d %9d %9s/s %7d %8.1f %6d", name, tick, factor,
-                         bodies, awake, bodies - awake, frame.mean_ms(), frame.p99_ms(), frame.max_ms(), auras,
+  return absl::StrFormat("%-7s %9d %6.2f %7d %7d %7d %8.2f %8.2f %8.2f %7d %9d %9s/s %7d %8.1f %10d", name, tick,
+                         factor, bodies, awake, bodies - awake, frame.mean_ms(), frame.p99_ms(), frame.max_ms(), auras,
                          transfers, HumanBytes(bytes_per_second), waits, static_cast<double>(wait_us) * 1e-6,
                          violations);
 }
@@ -89,9 +89,9 @@ std::vector<std::string> TableLines(const Heading& heading, const RunStatus& sta
   if (heading.last_tick > 0) absl::StrAppendFormat(&first, " of %.1f", Seconds(heading, heading.last_tick));
   absl::StrAppendFormat(&first, ", %.2f of real time", total.real_time_factor);
   std::vector<std::string> lines = {first, ""};
-  lines.push_back(absl::StrFormat("%-7s %9s %6s %7s %7s %7s %8s %8s %8s %7s %9s %11s %7s %8s %6s", "region", "tick",
+  lines.push_back(absl::StrFormat("%-7s %9s %6s %7s %7s %7s %8s %8s %8s %7s %9s %11s %7s %8s %10s", "region", "tick",
                                   "speed", "bodies", "awake", "asleep", "mean ms", "p99 ms", "max ms", "auras",
-                                  "transfers", "sent", "waits", "wait s", "broken"));
+                                  "transfers", "sent", "waits", "wait s", "violations"));
   for (size_t i = 0; i < status.regions.size(); ++i) {
     const RegionStatus& r = status.regions[i];
     lines.push_back(TableRow(absl::StrCat(i), r.report.tick(), r.report.real_time_factor(), r.report.bodies(),

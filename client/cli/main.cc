@@ -12,6 +12,7 @@ int main(int argc, char** argv) {
   aureole::CatchInterrupts();
   CLI::App app{"Aureole: one rigid-body world on many servers, with the answer of one."};
   app.name("aureole");
+  app.set_version_flag("--version", AUREOLE_VERSION);
   app.require_subcommand(1);
   app.footer(std::string("Examples:\n"
                          "  aureole up tests/worlds/demo.json\n"

@@ -4,7 +4,9 @@
 // A cluster that is sent is stepped k-1 ticks on its own *by the sender, at once*, and travels as the state in which
 // its receiver takes it over. That is the same computation as R2's shadow and the receiver's fast-forward, done once.
 #include <algorithm>
+#include <cmath>
 #include <iterator>
+#include <limits>
 #include <map>
 #include <set>
 
@@ -12,6 +14,7 @@
 
 #include "server/core/check.h"
 #include "server/core/holdings.h"
+#include "server/core/reach.h"
 #include "server/core/union_find.h"
 
 namespace aureole {
@@ -54,6 +57,9 @@ class DelayedExchange final : public Protocol {
   void Advance(std::vector<Frame>* out) override {
     if (!started_) {  // state 0: everybody must know of it before tick 1
       started_ = true;
+      AnnounceKicks();
+      CountHomes();
+      SetBounds();
       BoundaryNetworkUpdate(out);
       return;
     }
@@ -65,6 +71,7 @@ class DelayedExchange final : public Protocol {
     h_.engine->Step(now());
     ++h_.tick;
     AnnounceSpawns();
+    AnnounceKicks();
     DropOldShadows();
     CountHomes();
     Detect();
@@ -91,6 +98,13 @@ class DelayedExchange final : public Protocol {
   }
 
  private:
+  // R12: what a body can do within the horizon, and what its aura says of it.
+  struct Bound {
+    double push = 0, give = 0;  // m, as in Node
+    BodyId group = 0;
+    double energy = 0;  // of the group, J
+  };
+
   // What the sender of a cluster knows of one of its bodies while it is in flight: states sent .. sent+k-1.
   struct Shadow {
     RegionId owner = kNoRegion;
@@ -105,6 +119,7 @@ class DelayedExchange final : public Protocol {
       uint64_t hash = 0;
     };
     std::vector<State> states;
+    Bound bound;  // when it was sent
   };
 
   // A node of the graph that the decision of this tick looks at (R3).
@@ -113,6 +128,7 @@ class DelayedExchange final : public Protocol {
     RegionId owner;
     Box box;
     bool own;
+    double push = 0, give = 0;  // an edge when the gap is at most the sum of both: for AC, and for BT
   };
 
   Tick now() const { return h_.tick + 1; }
@@ -214,6 +230,21 @@ class DelayedExchange final : public Protocol {
 
   double ProjectReach() const { return margins_.project * step_; }
 
+  // R11, `reach`: impulses of the script are known as far ahead as an aura's bound must reach.
+  void AnnounceKicks() {
+    if (!reach_) return;
+    const Tick last = h_.tick + margins_.horizon + k_;
+    if (announced_ == 0) announced_ = h_.tick;
+    for (; announced_ < last; ++announced_) {
+      std::vector<Input> inputs;
+      ScriptedInputs(h_.world, announced_ + 1, &inputs);
+      for (const Input& i : inputs) {
+        if (i.kind == Input::Kind::kImpulse || i.kind == Input::Kind::kVelocity) kicks_.emplace(i.body, i);
+      }
+    }
+    std::erase_if(kicks_, [this](const auto& e) { return e.second.tick <= h_.tick; });
+  }
+
   // ------------------------------------------------------------------------------------------------ decision
 
   const BodyView OwnView(BodyId id) const {
@@ -256,39 +287,187 @@ class DelayedExchange final : public Protocol {
     leaving_.clear();
     FindForeign();
     moved_.clear();
+    SetBounds();
     AuraCollision();
     BoundaryTraverse();
   }
 
-  // The paper's AC (Algorithm 1) by R3 and R4: components over everything within D_pred, reached from what is foreign;
+  // How far everything reaches. `tolerance`: as far as the speed tolerance allows, everything alike.
+  void SetBounds() {
+    same_ = {margins_.predict * step_ / 2, margins_.give_back * step_ / 2, 0, 0};
+    most_push_ = same_.push;
+    most_give_ = same_.give;
+    for (Node& f : foreign_) {
+      f.push = same_.push;
+      f.give = same_.give;
+    }
+    if (!reach_) return;
+    bounds_.clear();
+    for (BodyId id : near_) bounds_[id];
+    for (const auto& [id, view] : waiting_) bounds_[id];
+    std::vector<BodyId> hits;
+    for (const Node& f : foreign_) OwnNear(f.box, margins_.give_back * step_, &hits);
+    for (RegionId peer : h_.peers) {
+      for (const auto& [y, a] : away_[peer]) {
+        if (a.owner != h_.self) OwnNear(Widen(a.box), ProjectReach(), &hits);
+      }
+    }
+    for (BodyId id : hits) bounds_[id];
+    ComputeReach();
+  }
+
+  double KickEnergy(BodyId id, const BodyView& v) const {
+    double speed = v.asleep ? 0 : v.velocity.norm(), energy = v.energy;
+    auto add = [&](const Input& i) {
+      if (i.kind == Input::Kind::kImpulse) speed += i.linear.norm() / v.mass;
+      if (i.kind == Input::Kind::kVelocity) speed = std::max(speed, i.linear.norm());
+      // No body of mass m inside a sphere of radius r has an inertia of more than m r^2.
+      const double spin =
+          i.kind == Input::Kind::kImpulse ? i.angular.norm() : i.angular.norm() * v.mass * v.radius * v.radius;
+      energy = std::max(energy, 0.5 * v.mass * speed * speed) +
+               (i.kind == Input::Kind::kVelocity ? 0.5 * spin * i.angular.norm() : 0);
+    };
+    const auto [begin, end] = kicks_.equal_range(id);
+    for (auto it = begin; it != end; ++it) add(it->second);
+    for (const Input& i : h_.pending) {
+      if (i.body == id && i.kind != Input::Kind::kSpawn) add(i);
+    }
+    return energy;
+  }
+
+  // R12. Foreign states are k ticks old: they move alone until now, then everything together; H - k ticks on is what AC
+  // looks at, H + k what BT looks at and what an aura says.
+  void ComputeReach() {
+    const Environment& e = h_.world.environment;
+    const ReachLimits limits{h_.world.tolerances.speed, h_.world.exchange.recovery, e.gravity.norm(), e.dt()};
+    std::vector<ReachNode> nodes;
+    std::vector<double> energies;
+    std::map<std::pair<RegionId, BodyId>, int> groups;
+    for (const Node& f : foreign_) {
+      ReachNode n;
+      n.id = f.id;
+      n.box = f.box;
+      const Aura aura = AuraOf(f.id);
+      n.mass = std::max(1e-9, static_cast<double>(aura.mass));
+      auto [it, fresh] = groups.emplace(std::pair{f.owner, aura.group}, static_cast<int>(energies.size()));
+      if (fresh) energies.push_back(0);
+      energies[it->second] = std::max(energies[it->second], static_cast<double>(aura.energy));
+      n.group = it->second;
+      nodes.push_back(n);
+    }
+    PropagateReach(nodes, &energies, {}, k_, limits);
+    const size_t foreign = nodes.size();
+    absl::flat_hash_map<BodyId, int> index;
+    std::vector<BodyId> ids;
+    for (const auto& [id, bound] : bounds_) ids.push_back(id);
+    std::sort(ids.begin(), ids.end());
+    for (BodyId id : ids) {
+      const BodyView v = OwnView(id);
+      index[id] = static_cast<int>(nodes.size());
+      nodes.push_back({id, SphereBox(v), v.mass, static_cast<int>(energies.size()), 0});
+      energies.push_back(KickEnergy(id, v));
+    }
+    std::vector<std::pair<int, int>> joined;
+    std::vector<BodyId> partners;
+    for (BodyId id : ids) {
+      partners.clear();
+      if (h_.engine->Contains(id)) h_.engine->Jointed(id, &partners);
+      for (BodyId other : partners) {
+        if (auto it = index.find(other); it != index.end()) joined.emplace_back(index[id], it->second);
+      }
+    }
+    PropagateReach(nodes, &energies, joined, margins_.horizon - k_, limits);
+    most_push_ = most_give_ = 0;
+    for (size_t i = 0; i < nodes.size(); ++i) {
+      (i < foreign ? foreign_[i].push : bounds_[nodes[i].id].push) = nodes[i].distance;
+      if (i >= foreign) most_push_ = std::max(most_push_, nodes[i].distance);
+    }
+    PropagateReach(nodes, &energies, joined, 2 * k_, limits);
+    std::vector<BodyId> name(energies.size(), 0);
+    for (size_t i = 0; i < nodes.size(); ++i) {
+      (i < foreign ? foreign_[i].give : bounds_[nodes[i].id].give) = nodes[i].distance;
+      if (i < foreign) continue;
+      most_give_ = std::max(most_give_, nodes[i].distance);
+      if (name[nodes[i].group] == 0) name[nodes[i].group] = nodes[i].id;
+      bounds_[nodes[i].id].group = name[nodes[i].group];
+      bounds_[nodes[i].id].energy = energies[nodes[i].group];
+    }
+  }
+
+  // What is known of a foreign body's bound.
+  Aura AuraOf(BodyId id) const {
+    if (auto s = shadows_.find(id); s != shadows_.end()) {
+      const auto& states = s->second.states;
+      return MakeAura(id, states[std::min<size_t>(h_.tick - s->second.sent, states.size() - 1)].view, s->second.owner);
+    }
+    for (const auto& [peer, auras] : remote_) {
+      if (auto a = auras.find(id); a != auras.end()) return a->second;
+    }
+    AUREOLE_CHECK(false, "no aura of body %llu", static_cast<unsigned long long>(id));
+  }
+
+  // The bound of an own body. `grown` is set when it had none: then all must be computed again, with it.
+  Bound BoundOf(BodyId id, bool* grown) {
+    if (!reach_) return same_;
+    auto [it, fresh] = bounds_.try_emplace(id);
+    *grown |= fresh;
+    return it->second;
+  }
+
+  // The paper's AC (Algorithm 1) by R3 and R4: components over everything that may meet, reached from what is foreign;
   // all own members go straight to the best rank among the owners.
   void AuraCollision() {
-    const double gap = margins_.predict * step_;
-    std::vector<Node> nodes = foreign_;
-    UnionFind sets(static_cast<int>(nodes.size()));
-    for (size_t i = 0; i < nodes.size(); ++i) {
-      for (size_t j = i + 1; j < nodes.size() && nodes[j].box.min.x() <= nodes[i].box.max.x() + gap; ++j) {
-        if (Gap(nodes[i].box, nodes[j].box) <= gap) sets.Unite(static_cast<int>(i), static_cast<int>(j));
-      }
-    }
-    absl::flat_hash_map<BodyId, int> index;
-    std::vector<BodyId> near;
-    for (size_t i = 0; i < nodes.size(); ++i) {
-      near.clear();
-      OwnNear(nodes[i].box, gap, &near);
-      if (nodes[i].own && h_.engine->Contains(nodes[i].id)) h_.engine->Jointed(nodes[i].id, &near);
-      for (BodyId id : near) {
-        auto [it, fresh] = index.emplace(id, static_cast<int>(nodes.size()));
-        if (fresh) {
-          nodes.push_back({id, h_.self, SphereBox(OwnView(id)), true});
-          sets.Add();
-        }
-        sets.Unite(static_cast<int>(i), it->second);
-      }
-    }
+    std::vector<Node> nodes;
+    UnionFind sets;
+    while (!FindComponents(&nodes, &sets)) ComputeReach();
     std::map<int, std::vector<int>> components;
     for (int i = 0; i < sets.size(); ++i) components[sets.Find(i)].push_back(i);
     for (const auto& [representative, members] : components) Push(nodes, members);
+  }
+
+  // False when bodies came up whose reach is not known yet.
+  bool FindComponents(std::vector<Node>* found, UnionFind* sets) {
+    std::vector<Node>& nodes = *found;
+    nodes = foreign_;
+    sets->Reset(static_cast<int>(nodes.size()));
+    double most = 0;
+    for (const Node& n : nodes) most = std::max(most, n.push);
+    for (size_t i = 0; i < nodes.size(); ++i) {
+      const double far = nodes[i].push + most;
+      for (size_t j = i + 1; j < nodes.size() && nodes[j].box.min.x() <= nodes[i].box.max.x() + far; ++j) {
+        if (Gap(nodes[i].box, nodes[j].box) <= nodes[i].push + nodes[j].push) {
+          sets->Unite(static_cast<int>(i), static_cast<int>(j));
+        }
+      }
+    }
+    bool grown = false;
+    absl::flat_hash_map<BodyId, int> index;
+    std::vector<BodyId> near;
+    for (size_t i = 0; i < nodes.size(); ++i) {
+      const Node n = nodes[i];
+      near.clear();
+      if (reach_ && n.own) {  // whoever may strike a member must be known
+        OwnNear(n.box, 2 * (margins_.horizon - k_) * step_, &near);
+        for (BodyId id : near) BoundOf(id, &grown);
+        near.clear();
+      }
+      OwnNear(n.box, n.push + most_push_, &near);
+      const size_t by_gap = near.size();
+      if (n.own && h_.engine->Contains(n.id)) h_.engine->Jointed(n.id, &near);
+      for (size_t q = 0; q < near.size(); ++q) {
+        const BodyId id = near[q];
+        const Box box = SphereBox(OwnView(id));
+        const Bound bound = BoundOf(id, &grown);
+        if (q < by_gap && Gap(box, n.box) > n.push + bound.push) continue;
+        auto [it, fresh] = index.emplace(id, static_cast<int>(nodes.size()));
+        if (fresh) {
+          nodes.push_back({id, h_.self, box, true, bound.push, bound.give});
+          sets->Add();
+        }
+        sets->Unite(static_cast<int>(i), it->second);
+      }
+    }
+    return !grown;
   }
 
   void Push(const std::vector<Node>& nodes, const std::vector<int>& members) {
@@ -335,32 +514,39 @@ class DelayedExchange final : public Protocol {
 
   // Grows `island` over D_ret until it is complete or something forbids its return. Components that were found to stay
   // are not walked again.
-  bool IslandQuery(std::vector<BodyId>* island, absl::flat_hash_map<BodyId, bool>* verdict) const {
-    const double gap = margins_.give_back * step_;
+  bool IslandQuery(std::vector<BodyId>* island, absl::flat_hash_map<BodyId, bool>* verdict) {
+    double most = 0;
+    for (const Node& f : foreign_) most = std::max(most, f.give);
     std::vector<BodyId> near;
     std::set<BodyId> seen(island->begin(), island->end());
     for (size_t i = 0; i < island->size(); ++i) {
       const BodyId id = (*island)[i];
       const Box box = SphereBox(OwnView(id));
       if (h_.rect.Gap(box) <= 0 || h_.tick - h_.held.at(id).arrived < h_.world.exchange.Dwell()) return false;
+      bool unknown = false;
+      const double give = BoundOf(id, &unknown).give;
+      if (unknown) return false;  // it stays until its reach is known
       for (const Node& f : foreign_) {
-        if (f.box.min.x() > box.max.x() + gap) break;
-        if (Gap(f.box, box) <= gap) return false;
+        if (f.box.min.x() > box.max.x() + give + most) break;
+        if (Gap(f.box, box) <= give + f.give) return false;
       }
       near.clear();
-      OwnNear(box, gap, &near);
+      OwnNear(box, give + most_give_, &near);
+      const size_t by_gap = near.size();
       if (h_.engine->Contains(id)) h_.engine->Jointed(id, &near);
-      for (BodyId other : near) {
-        auto it = verdict->find(other);
+      for (size_t q = 0; q < near.size(); ++q) {
+        if (q < by_gap && Gap(SphereBox(OwnView(near[q])), box) > give + BoundOf(near[q], &unknown).give) continue;
+        if (unknown) return false;
+        auto it = verdict->find(near[q]);
         if (it != verdict->end() && !it->second) return false;
-        if (seen.insert(other).second) island->push_back(other);
+        if (seen.insert(near[q]).second) island->push_back(near[q]);
       }
     }
     // Whatever left in this tick is foreign now, and near it is no place for an island.
     for (BodyId id : *island) {
       const Box box = SphereBox(OwnView(id));
       for (const Box& m : moved_) {
-        if (Gap(m, box) <= gap) return false;
+        if (Gap(m, box) <= margins_.give_back * step_) return false;
       }
     }
     return true;
@@ -383,6 +569,7 @@ class DelayedExchange final : public Protocol {
       s.sent = h_.tick;
       s.group = (groups_ * h_.world.layout.size()) + h_.self;
       s.states.push_back(StateOf(*h_.engine, id, OwnView(id)));
+      if (auto b = bounds_.find(id); b != bounds_.end()) s.bound = b->second;
       shadows_[id] = std::move(s);
     }
     Transfer t = h_.Depart(ids, to, cause);
@@ -463,11 +650,19 @@ class DelayedExchange final : public Protocol {
     a.id = id;
     a.box = RoundOutward(SphereBox(v));
     a.owner = owner;
-    a.asleep = v.asleep;
-    if (reach_) {
-      for (int i = 0; i < 3; ++i) a.velocity[i] = static_cast<float>(v.velocity[i]);
-      a.speed = static_cast<float>(v.asleep ? 0 : v.velocity.norm());
+    if (!reach_) return a;
+    a.group = id;
+    double energy = v.energy;
+    if (auto s = shadows_.find(id); s != shadows_.end()) {
+      a.group = s->second.bound.group;
+      energy = std::max(energy, s->second.bound.energy);
+    } else if (auto b = bounds_.find(id); b != bounds_.end()) {
+      a.group = b->second.group;
+      energy = b->second.energy;
     }
+    a.energy = std::nextafter(static_cast<float>(energy), std::numeric_limits<float>::infinity());
+    if (energy == 0) a.energy = 0;
+    a.mass = std::nextafter(static_cast<float>(v.mass), 0.0f);
     return a;
   }
 
@@ -565,6 +760,11 @@ class DelayedExchange final : public Protocol {
   std::map<BodyId, BodyView> waiting_;           // owned spawns that have not taken effect
   std::vector<Node> foreign_;                    // by min.x
   std::vector<Box> moved_;                       // of what was sent in this tick
+  Bound same_;                                   // of every body, in the `tolerance` policy
+  absl::flat_hash_map<BodyId, Bound> bounds_;    // of own bodies, in the `reach` policy
+  double most_push_ = 0, most_give_ = 0;         // over own bodies
+  std::multimap<BodyId, Input> kicks_;           // scripted impulses that are announced
+  Tick announced_ = 0;                           // up to this tick
   std::vector<BodyId> near_;
   std::map<RegionId, std::vector<Transfer>> leaving_;
   std::map<RegionId, Auras> told_;

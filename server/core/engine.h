@@ -47,6 +47,7 @@ struct BodyView {
   double radius = 0;  // of the sphere about `centre` that bounds `box` in every orientation of the body
   Vec3 velocity;      // m/s
   double mass = 0;    // kg
+  double energy = 0;  // kinetic, of turning too, J; 0 when asleep
   bool asleep = false;
 };
 

@@ -144,6 +144,7 @@ class ToyEngine final : public Engine {
     v.radius = std::max({b.half[0], b.half[1], b.half[2]});
     v.velocity = ToVec(b.velocity);
     v.mass = b.mass;
+    v.energy = b.asleep != 0 ? 0 : 0.5 * b.mass * v.velocity.squaredNorm();
     v.asleep = b.asleep != 0;
     return v;
   }

@@ -90,6 +90,11 @@ BodyView BulletEngine::View(BodyId id) const {
   view.velocity = FromBullet(body.rigid.getLinearVelocity());
   view.mass = body.mass;
   view.asleep = body.asleep;
+  if (!body.asleep) {
+    const btVector3 turning = body.rigid.getAngularVelocity() * body.rigid.getWorldTransform().getBasis();
+    const btVector3 spin = turning * body.rigid.getLocalInertia();
+    view.energy = 0.5 * body.mass * view.velocity.squaredNorm() + 0.5 * turning.dot(spin);
+  }
   return view;
 }
 

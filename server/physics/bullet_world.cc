@@ -55,7 +55,7 @@ BulletWorld::BulletWorld(std::shared_ptr<Surroundings> surroundings, int pool)
 
 BulletWorld::~BulletWorld() {
   joints_.clear();
-  while (!bodies_.empty()) Remove(bodies_.begin()->second.get());
+  for (auto& [id, body] : bodies_) broadphase_.Remove(body.get());
   for (auto& [id, body] : fixed_) broadphase_.Remove(body.get());
 }
 

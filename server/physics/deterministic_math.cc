@@ -305,6 +305,7 @@ double Power(double x, double y) {
   if (ax == 0) return y > 0 ? sign * 0.0 : sign * Infinity();
   if (IsInfinite(ax)) return y > 0 ? sign * Infinity() : sign * 0.0;
   if (Negative(x) && !integer) return NotANumber();
+  if (ax == 1) return sign;
   const Pair l = LogPair(ax);
   if (Magnitude(y * l.high) > 800) return sign * (y * l.high > 0 ? Infinity() : 0.0);
   if (Magnitude(y) < 0x1p-900) return sign;

@@ -26,6 +26,8 @@ namespace aureole {
 namespace {
 
 constexpr uint32_t kControlProtocolVersion = 1;
+// Leaving takes milliseconds. A process that is stuck in it is ended by the kernel, so that none is left behind.
+constexpr unsigned kLongestLeaveSeconds = 10;
 
 sigset_t TakenSignals() {
   sigset_t set;
@@ -220,6 +222,7 @@ int RunRegionServer(const RegionServerOptions& options) {
   while (HandleEvent(&process, process.events.Pop(), &exit_code, &reason)) {
   }
   spdlog::log(exit_code == 0 ? spdlog::level::info : spdlog::level::err, "leaving: {}", reason);
+  alarm(kLongestLeaveSeconds);
   process.server->SetServing(false);
   process.simulation.Stop();
   if (process.hosted != nullptr) {
@@ -228,7 +231,6 @@ int RunRegionServer(const RegionServerOptions& options) {
     process.hosted->links().Drain(std::chrono::seconds(1));
   }
   process.control->Close(reason);
-  process.hosted.reset();
   return exit_code;
 }
 

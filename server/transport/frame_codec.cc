@@ -1,6 +1,5 @@
 #include "server/transport/frame_codec.h"
 
-#include <bit>
 #include <cmath>
 
 #include <absl/strings/str_cat.h>
@@ -36,15 +35,11 @@ void AddBox(const WireBox& box, Floats* out) {
   out->Add(std::begin(box.max), std::end(box.max));
 }
 
-bool IsPositiveZero(float f) { return std::bit_cast<uint32_t>(f) == 0; }
-
 void EncodeAuras(const std::vector<Aura>& auras, v1::Frame* out) {
-  bool owners = false, velocities = false, speeds = false, sleepers = false;
+  bool owners = false, bounds = false;
   for (const Aura& a : auras) {
     owners |= a.owner != kNoRegion;
-    for (float v : a.velocity) velocities |= !IsPositiveZero(v);
-    speeds |= !IsPositiveZero(a.speed);
-    sleepers |= a.asleep;
+    bounds |= a.group != 0 || a.energy != 0 || a.mass != 0;
   }
   IdWriter ids(out->mutable_aura_id());
   out->mutable_aura_box()->Reserve(static_cast<int>(6 * auras.size()));
@@ -52,9 +47,10 @@ void EncodeAuras(const std::vector<Aura>& auras, v1::Frame* out) {
     ids.Add(a.id);
     AddBox(a.box, out->mutable_aura_box());
     if (owners) out->add_aura_owner(static_cast<uint32_t>(a.owner + 1));
-    if (velocities) out->mutable_aura_velocity()->Add(std::begin(a.velocity), std::end(a.velocity));
-    if (speeds) out->add_aura_speed(a.speed);
-    if (sleepers) out->add_aura_asleep(a.asleep);
+    if (!bounds) continue;
+    out->add_aura_group(static_cast<int64_t>(a.group - a.id));
+    out->add_aura_energy(a.energy);
+    out->add_aura_mass(a.mass);
   }
 }
 
@@ -154,9 +150,10 @@ absl::Status DecodeAuras(const v1::Frame& in, std::vector<Aura>* out) {
   AUREOLE_RETURN_IF_ERROR(DecodeIds("aura_id", in.aura_id(), kMaxAuras, false, &ids));
   AUREOLE_RETURN_IF_ERROR(CheckColumn("aura_box", in.aura_box_size(), 6, ids.size(), false));
   AUREOLE_RETURN_IF_ERROR(CheckColumn("aura_owner", in.aura_owner_size(), 1, ids.size(), true));
-  AUREOLE_RETURN_IF_ERROR(CheckColumn("aura_velocity", in.aura_velocity_size(), 3, ids.size(), true));
-  AUREOLE_RETURN_IF_ERROR(CheckColumn("aura_speed", in.aura_speed_size(), 1, ids.size(), true));
-  AUREOLE_RETURN_IF_ERROR(CheckColumn("aura_asleep", in.aura_asleep_size(), 1, ids.size(), true));
+  const auto bounds = static_cast<size_t>(in.aura_group_size());
+  AUREOLE_RETURN_IF_ERROR(CheckColumn("aura_group", in.aura_group_size(), 1, ids.size(), true));
+  AUREOLE_RETURN_IF_ERROR(CheckColumn("aura_energy", in.aura_energy_size(), 1, bounds, false));
+  AUREOLE_RETURN_IF_ERROR(CheckColumn("aura_mass", in.aura_mass_size(), 1, bounds, false));
   out->resize(ids.size());
   for (size_t i = 0; i < ids.size(); ++i) {
     Aura& a = (*out)[i];
@@ -164,13 +161,12 @@ absl::Status DecodeAuras(const v1::Frame& in, std::vector<Aura>* out) {
     a.id = ids[i];
     AUREOLE_RETURN_IF_ERROR(DecodeBox("aura_box", a.id, in.aura_box().data() + 6 * i, &a.box));
     if (in.aura_owner_size() > 0) AUREOLE_RETURN_IF_ERROR(DecodeRegion("aura_owner", in.aura_owner(n), &a.owner));
-    for (int axis = 0; axis < 3 && in.aura_velocity_size() > 0; ++axis) {
-      a.velocity[axis] = in.aura_velocity(3 * n + axis);
-      if (!std::isfinite(a.velocity[axis])) return Bad("aura_velocity", absl::StrCat("of body ", a.id));
-    }
-    if (in.aura_speed_size() > 0) a.speed = in.aura_speed(n);
-    if (!std::isfinite(a.speed) || a.speed < 0) return Bad("aura_speed", absl::StrCat("of body ", a.id));
-    if (in.aura_asleep_size() > 0) a.asleep = in.aura_asleep(n);
+    if (bounds == 0) continue;
+    a.group = a.id + static_cast<uint64_t>(in.aura_group(n));
+    a.energy = in.aura_energy(n);
+    a.mass = in.aura_mass(n);
+    if (!(a.energy >= 0)) return Bad("aura_energy", absl::StrCat("of body ", a.id));
+    if (!(a.mass >= 0)) return Bad("aura_mass", absl::StrCat("of body ", a.id));
   }
   return absl::OkStatus();
 }

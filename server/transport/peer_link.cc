@@ -44,8 +44,10 @@ class DialStream final : public grpc::ClientBidiReactor<v1::PeerMessage, v1::Pee
   }
   void OnWriteDone(bool ok) override { link_->Written(this, ok); }
   void OnDone(const grpc::Status& status) override {
-    link_->Gone(this, status);
+    PeerLink* const link = link_;
+    link->Gone(this, status);
     delete this;
+    link->Released();
   }
 
  private:
@@ -219,9 +221,13 @@ absl::Status PeerLink::ReadHello(LinkStream* stream, const v1::LinkHello& hello)
 
 absl::Status PeerLink::Read(LinkStream* stream, v1::PeerMessage* message) {
   if (message->has_hello()) return ReadHello(stream, message->hello());
+  {
+    const std::lock_guard lock(mutex_);
+    if (stream != current_) return absl::AbortedError("replaced by a newer stream");
+    if (!stream->greeted) return absl::InvalidArgumentError("the first message is no hello");
+  }
   std::string bytes;
-  absl::StatusOr<bool> whole =
-      stream->greeted ? Assemble(stream, message, &bytes) : absl::InvalidArgumentError("the first message is no hello");
+  absl::StatusOr<bool> whole = Assemble(stream, message, &bytes);
   absl::Status s = whole.status();
   Frame frame;
   if (s.ok() && *whole) {
@@ -313,7 +319,6 @@ bool PeerLink::End(LinkStream* stream) {
 
 void PeerLink::Gone(LinkStream* stream, const grpc::Status& status) {
   const std::lock_guard lock(mutex_);
-  --streams_;
   if (current_ == stream) {
     current_ = nullptr;
     if (status.error_code() == grpc::StatusCode::FAILED_PRECONDITION) ++stats_.refused_hellos;
@@ -324,6 +329,11 @@ void PeerLink::Gone(LinkStream* stream, const grpc::Status& status) {
     }
     if (channel_ != nullptr && !closed_) Redial();
   }
+}
+
+void PeerLink::Released() {
+  const std::lock_guard lock(mutex_);
+  --streams_;
   changed_.notify_all();
 }
 

@@ -123,8 +123,11 @@ class PeerLink {
   bool Written(LinkStream* stream, bool ok);
   // Nothing more will be read, and no further write may start. True when none is in flight.
   bool End(LinkStream* stream);
-  // The stream will not call again. `status` is the dialled side's verdict.
+  // The connection is over, for the dialled side's reason `status`; the link forgets the stream.
   void Gone(LinkStream* stream, const grpc::Status& status);
+  // After Gone, once the stream has been deleted: what it held of gRPC must not outlive Close. gRPC 1.51 breaks when
+  // the last holder of a channel is one of its own threads (grpc/grpc#32584).
+  void Released();
 
  private:
   v1::LinkHello Hello() const;
@@ -148,7 +151,7 @@ class PeerLink {
   uint64_t told_ = 0;              // what the peer knows that we applied
   uint64_t peer_incarnation_ = 0;  // 0: not met yet
   LinkStream* current_ = nullptr;
-  int streams_ = 0;  // that still may call
+  int streams_ = 0;  // not yet released
   bool closed_ = false;
   bool redialling_ = false;
   int backoff_ms_;

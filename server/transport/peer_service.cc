@@ -38,8 +38,10 @@ class AcceptStream final : public grpc::ServerBidiReactor<v1::PeerMessage, v1::P
   }
 
   void OnDone() override {
-    if (link() != nullptr) link()->Gone(this, verdict_);
+    PeerLink* const link = this->link();
+    if (link != nullptr) link->Gone(this, verdict_);
     delete this;
+    if (link != nullptr) link->Released();
   }
 
  private:

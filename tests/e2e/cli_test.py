@@ -109,11 +109,12 @@ class Terminal(Cli):
         os.close(slave)
         text = b""
         until = time.monotonic() + DEADLINE_S
-        while text.count(b"\x1b[10A") < 2 and time.monotonic() < until:
+        while text.count(b"demo: running") < 2 and time.monotonic() < until:
             if select.select([master], [], [], 1)[0]:
                 text += os.read(master, 65536)
         self.assertGreaterEqual(text.count(b"demo: running, 4 regions"), 2)
-        for word in (b"region ", b"awake", b"asleep", b"p99 ms", b"transfers", b"waits", b"all "):
+        self.assertIn(b"\x1b[9A", text)  # nine lines up, over what was drawn before
+        for word in (b"region ", b"awake", b"asleep", b"p99 ms", b"transfers", b"waits", b"violations", b"all "):
             self.assertIn(word, text)
         servers = self.servers_of(process, 4)
         os.write(master, b"\x03")
@@ -234,6 +235,14 @@ class Results(Cli):
         self.assertTrue(result["ok"])
         self.assertEqual((result["tick"], result["bodies"], len(result["regions"])), (625, 120, 4))
         self.assertEqual([h["tick"] for h in result["hashes"]], [100, 200, 300, 400, 500, 600, 625])
+
+    def test_control_plane_of_its_own_runs_a_world(self):
+        process = subprocess.run([BIN / "aureole-control", WORLDS / "demo.json", "--duration", "10s", "--no-real-time",
+                                  *self.fake()], capture_output=True, text=True, timeout=DEADLINE_S,
+                                 env={**os.environ, "TMPDIR": self.directory.name})
+        self.assertEqual(process.returncode, 0, process.stderr)
+        self.assertIn("[control] finished, 4 regions", process.stderr)
+        self.assertIn("[control] 625 ticks, 120 bodies", process.stderr)
 
     def test_interrupted_before_the_end_is_said(self):
         process = self.start("up", WORLDS / "demo.json", "--duration", "60s", *self.fake())

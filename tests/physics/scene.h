@@ -20,7 +20,7 @@ struct PhysicsScene {
 };
 
 // `clusters` heaps of `per` bodies on pedestals of all static kinds, kinematic pushers, turntables and gates that
-// start and stop, joints of all kinds, materials of all kinds, a quarter of the bodies with CCD. Inputs every 50 ticks.
+// start and stop, joints of all kinds, materials of all kinds, a third of the bodies with CCD. Inputs every 50 ticks.
 PhysicsScene MakePhysicsScene(uint64_t seed, int clusters, int per, Tick ticks);
 
 // Bodies far from any such scene, at random places within 40 m.

@@ -7,19 +7,20 @@ namespace aureole::sim {
 
 class Random {
  public:
-  explicit Random(uint64_t seed) : state_(seed * 0x9e3779b97f4a7c15ull + 0x632be59bd9b4e019ull) { Next(); }
-  uint64_t Next() {
-    uint64_t z = (state_ += 0x9e3779b97f4a7c15ull);
-    z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9ull;
-    z = (z ^ (z >> 27)) * 0x94d049bb133111ebull;
-    return z ^ (z >> 31);
-  }
+  // The seed is mixed first: the state of neighbouring seeds must not be neighbours, or their streams overlap.
+  explicit Random(uint64_t seed) : state_(Mix(seed + 0x632be59bd9b4e019ull)) {}
+  uint64_t Next() { return Mix(state_ += 0x9e3779b97f4a7c15ull); }
   double Unit() { return static_cast<double>(Next() >> 11) * 0x1.0p-53; }
   double In(double a, double b) { return a + (b - a) * Unit(); }
   int Below(int n) { return static_cast<int>(Next() % static_cast<uint64_t>(n)); }
   bool Chance(double p) { return Unit() < p; }
 
  private:
+  static uint64_t Mix(uint64_t z) {
+    z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9ull;
+    z = (z ^ (z >> 27)) * 0x94d049bb133111ebull;
+    return z ^ (z >> 31);
+  }
   uint64_t state_;
 };
 

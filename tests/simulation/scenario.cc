@@ -142,6 +142,7 @@ struct Builder {
   double width;
   Placer placer;
   double top_speed;  // of what a scene throws
+  std::optional<Vec3> stirred;
 
   Builder(World& w, Random& r, bool t, double wid)
       : world(w),
@@ -267,6 +268,22 @@ struct Builder {
     }
   }
 
+  // A loose crowd along a border that is driven to and fro over it, so that touching bodies change owner all the time.
+  void Stir(int n) {
+    const Vec3 centre = NearBorder(0.2);
+    for (int i = 0; i < n; ++i) {
+      BodySpec b = placer.Body(placer.RandomShape(0.15, 0.4));
+      if (!placer.Place(&b, 0.005, [&](int) -> Vec3 {
+            return centre + Vec3(rng.In(-4, 4), toy ? 0 : rng.In(0, 1), rng.In(-10, 10));
+          })) {
+        continue;
+      }
+      b.material.rolling_friction = 0.02;
+      Add(b);
+    }
+    stirred = centre;
+  }
+
   void Sleep(BodySpec* b) const {
     b->velocity = Vec3::Zero();
     b->asleep = toy;  // a body of the real engine falls asleep where it rests
@@ -345,7 +362,8 @@ void SortScript(World* world) {
 }
 
 // Throws bodies at each other by what the undivided run shows, and appends these impulses to the script.
-void Aim(Scenario* scenario, double rate, double top_speed, Random& rng, const EngineFactory& make_engine) {
+void Aim(Scenario* scenario, double rate, double top_speed, const std::optional<Vec3>& stirred, Random& rng,
+         const EngineFactory& make_engine) {
   World& world = scenario->world;
   std::unique_ptr<Engine> engine = make_engine(world.environment);
   for (const BodySpec& b : world.bodies) engine->Spawn(b);
@@ -368,6 +386,12 @@ void Aim(Scenario* scenario, double rate, double top_speed, Random& rng, const E
           const bool x = std::fabs(to.x()) > std::fabs(to.z());
           velocity = x ? Vec3(to.x() > 0 ? speed : -speed, 0, 0) : Vec3(0, 0, to.z() > 0 ? speed : -speed);
         }
+      }
+      if (stirred) {
+        const Vec3 to = *stirred + Vec3(rng.In(-3, 3), 0, rng.In(-8, 8)) - me.centre;
+        velocity = Vec3(to.x() * 2, 0, to.z() * 0.5);
+        if (velocity.norm() > 12) velocity *= 12 / velocity.norm();
+        velocity.y() = scenario->world.environment.gravity.y() < 0 ? rng.In(0, 2) : 0;
       }
       Input in;
       in.kind = Input::Kind::kVelocity;
@@ -405,7 +429,7 @@ void AddLive(Scenario* s, int n, Random& rng) {
 }  // namespace
 
 const std::vector<std::string>& Scenes() {
-  static const std::vector<std::string> names{"burst", "heap", "cradle", "scatter", "drift"};
+  static const std::vector<std::string> names{"burst", "heap", "cradle", "scatter", "drift", "stir"};
   return names;
 }
 
@@ -431,10 +455,11 @@ Scenario MakeScenario(uint64_t seed, const ScenarioOptions& options, const Engin
     world.environment.fixed.push_back(floor);
   }
   const int k = rng.Below(8);
-  world.exchange.k = options.k.value_or(k < 4 ? 0 : k < 6 ? 1 : k - 4);
+  world.exchange.k = options.k.value_or(k < 5 ? 0 : k - 4);
   const bool reach = rng.Chance(0.5);
   world.exchange.policy = options.policy.value_or(reach ? AuraPolicy::kReach : AuraPolicy::kTolerance);
-  world.exchange.recovery = options.toy ? 0 : 0.05;
+  // The toy's solver pushes nothing, but its memory of contacts adds a little energy.
+  world.exchange.recovery = options.toy ? (world.exchange.policy == AuraPolicy::kReach ? 0.02 : 0) : 0.05;
   if (!options.returns) world.exchange.dwell = 1 << 30;
   world.tolerances.speed = kSpeed;
   if (!options.margin_overrides.empty() && world.exchange.k > 0) OverrideMargins(options, &world);
@@ -443,7 +468,9 @@ Scenario MakeScenario(uint64_t seed, const ScenarioOptions& options, const Engin
 
   Scenario s(std::move(world));
   s.layout = layout_name;
-  s.scene = options.scene.value_or(Scenes()[rng.Below(static_cast<int>(Scenes().size()))]);
+  // Most worlds are stirred crowds: an easy world is no proof.
+  const bool stir = rng.Chance(0.7);
+  s.scene = options.scene.value_or(stir ? "stir" : Scenes()[rng.Below(static_cast<int>(Scenes().size()))]);
   s.ticks = options.toy ? 60 + rng.Below(100) : 150 + rng.Below(100);
   Builder build(s.world, rng, options.toy, width);
   const int size = options.toy ? 1 + rng.Below(3) : 3;
@@ -451,13 +478,21 @@ Scenario MakeScenario(uint64_t seed, const ScenarioOptions& options, const Engin
   if (s.scene == "heap") build.Heap(size * (8 + rng.Below(16)));
   if (s.scene == "cradle") build.Cradle(4 + size * rng.Below(5));
   if (s.scene == "scatter") build.Scatter(size * (5 + rng.Below(8)));
+  if (s.scene == "stir") {
+    build.Stir(options.toy ? 15 + rng.Below(30) : 40 + rng.Below(60));
+    s.ticks = options.toy ? 150 : 750;
+  }
   if (s.scene == "drift") build.Drift(size * (6 + rng.Below(9)));
-  if (rng.Chance(0.4)) build.AddJoints(1 + rng.Below(2));
+  if (build.stirred) {
+    build.AddJoints(static_cast<int>(s.world.bodies.size()) / 6);
+  } else if (rng.Chance(0.4)) {
+    build.AddJoints(1 + rng.Below(2));
+  }
   if (rng.Chance(0.4)) build.AddSpawns(1 + rng.Below(size * 4), s.ticks);
   if (rng.Chance(0.2)) build.AddRemovals(1 + rng.Below(2), s.ticks);
   SortScript(&s.world);
   const double rate = s.scene == "drift" ? 0.01 : rng.Chance(0.3) ? 0 : rng.Chance(0.5) ? 0.02 : 0.12;
-  Aim(&s, options.toy ? rate : rate / 4, build.top_speed, rng, make_engine);
+  Aim(&s, build.stirred ? 0.06 : options.toy ? rate : rate / 4, build.top_speed, build.stirred, rng, make_engine);
   if (rng.Chance(0.2)) AddLive(&s, 1 + rng.Below(10), rng);
   return s;
 }

@@ -52,6 +52,12 @@ TEST(ExperimentReport, TableNamesTheRegionThatMissedTheAimAndItsClusters) {
       << text;
 }
 
+TEST(ExperimentReport, TableHasBothFrameTimesTheirRatioAndTheIdeal) {
+  const std::string text = TableText(TwoRuns(12));
+  EXPECT_NE(text.find("last max ms one server ms  ratio ideal 1/n ratio/ideal\n"), std::string::npos) << text;
+  EXPECT_NE(text.find("      12.00         40.00  0.300     0.250        1.20\n"), std::string::npos) << text;
+}
+
 TEST(ExperimentReport, TableIsSilentWhereTheAimIsMet) {
   EXPECT_EQ(TableText(TwoRuns(12)).find("aim"), std::string::npos);
 }

@@ -20,11 +20,9 @@ Aura MakeAura(BodyId id, bool predicted) {
   a.box = {{x, 0.1f, -3}, {x + 0.6f, 0.7f, -2.4f}};
   if (predicted) {
     a.owner = static_cast<RegionId>(id % 3);
-    a.velocity[0] = 1.5f;
-    a.velocity[1] = -0.0f;
-    a.velocity[2] = std::numeric_limits<float>::denorm_min();
-    a.speed = 3.25f;
-    a.asleep = id % 2 == 0;
+    a.group = id - id % 7;
+    a.energy = std::numeric_limits<float>::denorm_min();
+    a.mass = 3.25f;
   }
   return a;
 }
@@ -70,7 +68,6 @@ void ExpectSame(const Frame& a, const Frame& b) {
   ASSERT_EQ(a.auras.size(), b.auras.size());
   for (size_t i = 0; i < a.auras.size(); ++i) {
     EXPECT_EQ(a.auras[i], b.auras[i]);
-    EXPECT_EQ(std::memcmp(a.auras[i].velocity, b.auras[i].velocity, sizeof(a.auras[i].velocity)), 0);
   }
   EXPECT_EQ(a.gone, b.gone);
   EXPECT_EQ(a.edges, b.edges);
@@ -165,9 +162,10 @@ TEST(FrameCodec, RefusesWhatNoRegionSends) {
   refused("frame.aura_box", [](v1::Frame* f) { f->set_aura_box(4, std::nanf("")); });
   refused("frame.aura_owner", [](v1::Frame* f) { f->set_aura_owner(0, kMaxRegions + 1); });
   refused("frame.aura_owner", [](v1::Frame* f) { f->add_aura_owner(1); });
-  refused("frame.aura_velocity", [](v1::Frame* f) { f->set_aura_velocity(0, INFINITY); });
-  refused("frame.aura_speed", [](v1::Frame* f) { f->set_aura_speed(0, -1); });
-  refused("frame.aura_asleep", [](v1::Frame* f) { f->add_aura_asleep(true); });
+  refused("frame.aura_group", [](v1::Frame* f) { f->add_aura_group(1); });
+  refused("frame.aura_energy", [](v1::Frame* f) { f->set_aura_energy(0, std::nanf("")); });
+  refused("frame.aura_energy", [](v1::Frame* f) { f->add_aura_energy(1); });
+  refused("frame.aura_mass", [](v1::Frame* f) { f->set_aura_mass(0, -1); });
   refused("frame.gone_id", [](v1::Frame* f) { f->set_gone_id(0, 0); });
   refused("frame.edge_step", [](v1::Frame* f) { f->set_edge_step(0, 0); });
   refused("frame.edge_step", [](v1::Frame* f) { f->add_edge_step(1); });
