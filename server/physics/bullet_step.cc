@@ -174,19 +174,16 @@ void BulletWorld::AddPredictiveContacts(std::span<Body*> bodies) {
   predictive_.clear();
   for (Body* b : bodies) {
     if (!b->ccd || !MovesFast(*b, (b->rigid.getLinearVelocity() * dt_).length2())) continue;
-    btTransform target;
-    b->rigid.predictIntegratedTransform(dt_, target);
     SweepHit hit;
-    if (!Sweep(*b, target, &hit)) continue;
-    const btTransform& pose = b->rigid.getWorldTransform();
-    const btVector3 way = (target.getOrigin() - pose.getOrigin()) * hit.fraction;
-    const btVector3 there = pose.getOrigin() + way;
+    if (!Sweep(*b, b->rigid.getLinearVelocity() * dt_, dt_, &hit)) continue;
+    const btVector3& here = b->rigid.getWorldTransform().getOrigin();
+    const btVector3 there = here + hit.way;
     btManifoldPoint point(btVector3(0, 0, 0), hit.other->rigid.getWorldTransform().inverse() * there, hit.normal,
-                          way.dot(-hit.normal));
+                          hit.way.dot(-hit.normal));
     btPersistentManifold* manifold = contacts_.dispatcher()->getNewManifold(&b->rigid, &hit.other->rigid);
     btManifoldPoint& added = manifold->getContactPoint(manifold->addManifoldPoint(point, true));
     added.m_combinedFriction = btManifoldResult::calculateCombinedFriction(&b->rigid, &hit.other->rigid);
-    added.m_positionWorldOnA = pose.getOrigin();
+    added.m_positionWorldOnA = here;
     added.m_positionWorldOnB = there;
     predictive_.push_back(manifold);
     solver_manifolds_.push_back(manifold);
@@ -202,7 +199,8 @@ void BulletWorld::Integrate(std::span<Body*> bodies) {
     b->rigid.predictIntegratedTransform(dt_, targets_[i]);
     if (!b->ccd || !MovesFast(*b, (b->rigid.getLinearVelocity() * dt_).length2())) continue;
     SweepHit hit;
-    if (Sweep(*b, targets_[i], &hit)) b->rigid.predictIntegratedTransform(dt_ * hit.fraction, targets_[i]);
+    if (Sweep(*b, b->rigid.getLinearVelocity() * dt_, dt_, &hit))
+      b->rigid.predictIntegratedTransform(dt_ * hit.fraction, targets_[i]);
   }
   for (size_t i = 0; i < bodies.size(); ++i) {
     bodies[i]->rigid.proceedToTransform(targets_[i]);

@@ -21,7 +21,7 @@ class ClosestAhead : public btCollisionWorld::ClosestConvexResultCallback {
 
 }  // namespace
 
-bool Sweep(const Body& body, const btTransform& target, SweepHit* hit) {
+bool Sweep(const Body& body, const btVector3& motion, double dt, SweepHit* hit) {
   std::vector<Body*> candidates;
   for (const Pair* p : body.pairs) {
     Body* other = p->Other(&body);
@@ -31,18 +31,22 @@ bool Sweep(const Body& body, const btTransform& target, SweepHit* hit) {
 
   const btSphereShape sphere(body.shape->smallest * kSphereShare);
   const btTransform& from = body.rigid.getWorldTransform();
-  const btTransform to(from.getBasis(), target.getOrigin());
-  ClosestAhead closest(from.getOrigin(), to.getOrigin());
   for (Body* other : candidates) {
-    const double before = closest.m_closestHitFraction;
+    // In the other's frame, so that two bodies shot at each other meet. A kinematic body is already where it goes.
+    btVector3 relative = motion;
+    if (other->dynamic()) relative -= other->rigid.getLinearVelocity() * dt;
+    const btTransform to(from.getBasis(), from.getOrigin() + relative);
+    ClosestAhead closest(from.getOrigin(), to.getOrigin());
+    closest.m_closestHitFraction = hit->fraction;
     btCollisionWorld::objectQuerySingle(&sphere, from, to, &other->rigid, other->shape->whole,
                                         other->rigid.getWorldTransform(), closest, kAllowedPenetration);
-    if (closest.m_closestHitFraction < before) hit->other = other;
+    if (closest.m_closestHitFraction >= hit->fraction) continue;
+    hit->other = other;
+    hit->fraction = closest.m_closestHitFraction;
+    hit->way = relative * hit->fraction;
+    hit->normal = closest.m_hitNormalWorld;
   }
-  if (hit->other == nullptr) return false;
-  hit->fraction = closest.m_closestHitFraction;
-  hit->normal = closest.m_hitNormalWorld;
-  return true;
+  return hit->other != nullptr;
 }
 
 bool MayCollide(const Body& a, const Body& b) {

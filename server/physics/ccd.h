@@ -12,14 +12,15 @@ inline bool MovesFast(const Body& body, double distance2) {
 
 struct SweepHit {
   Body* other = nullptr;
-  double fraction = 1;  // of the motion
+  double fraction = 1;  // of the tick's motion
+  btVector3 way;        // m; the body's motion until then, relative to the other one
   btVector3 normal;     // out of the other body
 };
 
-// The first body in the way from the present pose to `target`. Candidates are the bodies whose exact boxes overlap this
-// one's; so who is asked is a function of the contact component (L7b). Ties go to the smaller id. Sees every body where
-// it is now.
-bool Sweep(const Body& body, const btTransform& target, SweepHit* hit);
+// The first body that this one meets within `dt` seconds when it moves by `motion` (m) and the others go on at their
+// velocities. Candidates are the bodies whose exact boxes overlap this one's; so who is asked is a function of the
+// contact component (L7b). Ties go to the smaller id. Sees every body where it is now.
+bool Sweep(const Body& body, const btVector3& motion, double dt, SweepHit* hit);
 
 // Whether joints let the two bodies collide.
 bool MayCollide(const Body& a, const Body& b);
