@@ -29,12 +29,18 @@ void Broadphase::Remove(Body* body) {
 
 void Broadphase::Update(Body* body, const btVector3& motion) {
   btDbvtVolume volume = btDbvtVolume::FromMM(body->low, body->high);
-  if (!(body->dynamic() ? moving_ : fixed_).update(body->leaf, volume, motion, kFat)) return;
-  for (size_t i = body->pairs.size(); i-- > 0;) {
-    Pair* p = body->pairs[i];
-    if (!Intersect(body->leaf->volume, p->Other(body)->leaf->volume)) RemovePair(p);
+  if ((body->dynamic() ? moving_ : fixed_).update(body->leaf, volume, motion, kFat)) moved_.push_back(body);
+}
+
+void Broadphase::Commit() {
+  for (Body* body : moved_) {
+    for (size_t i = body->pairs.size(); i-- > 0;) {
+      Pair* p = body->pairs[i];
+      if (!Intersect(body->leaf->volume, p->Other(body)->leaf->volume)) RemovePair(p);
+    }
   }
-  FindPairs(body);
+  for (Body* body : moved_) FindPairs(body);
+  moved_.clear();
 }
 
 void Broadphase::Rebalance() { moving_.optimizeIncremental(1 + moving_.m_leaves / 200); }

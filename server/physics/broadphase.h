@@ -21,8 +21,10 @@ class Broadphase {
   void Insert(Body* body);
   // Removes the body and its pairs.
   void Remove(Body* body);
-  // The body's exact box has changed; `motion` (m) is how far it is likely to go soon.
+  // The body's exact box has changed; `motion` (m) is how far it is likely to go soon. Takes effect in Commit, after
+  // the boxes of all bodies that move together have changed: a pair that only seems to part in between must live on.
   void Update(Body* body, const btVector3& motion);
+  void Commit();
   // Keeps the trees shallow; once a tick.
   void Rebalance();
 
@@ -54,7 +56,7 @@ class Broadphase {
   btDbvt fixed_;           // static and kinematic ones
   std::deque<Pair> pool_;
   std::vector<Pair*> free_;
-  std::vector<Body*> close_;
+  std::vector<Body*> moved_, close_;
 };
 
 }  // namespace aureole::physics

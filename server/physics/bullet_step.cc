@@ -46,6 +46,7 @@ void BulletWorld::MoveKinematic(Tick n) {
       b->rigid.setWorldTransform(to);
       RefreshBox(b);
       broadphase_.Update(b, 2 * (to.getOrigin() - from.getOrigin()));
+      broadphase_.Commit();
     }
     if (!b->moving) continue;
     for (Pair* p : b->pairs) {
@@ -220,6 +221,7 @@ void BulletWorld::Settle() {
     if (b->swept > 0) max_radius_ = std::max(max_radius_, Radius(*b));
     broadphase_.Update(b, b->rigid.getLinearVelocity() * (2 * dt_));
   }
+  broadphase_.Commit();
   broadphase_.Rebalance();
 }
 

@@ -221,6 +221,7 @@ void BulletWorld::FallAsleep(Body* body) {
   if (body->swept > 0) {  // the box no longer holds a motion
     RefreshBox(body);
     broadphase_.Update(body, btVector3(0, 0, 0));
+    broadphase_.Commit();
   }
   NoteSleeper(body);
 }
@@ -243,6 +244,7 @@ void BulletWorld::SetVelocities(Body* body, const btVector3& velocity, const btV
   RefreshBox(body);
   max_radius_ = std::max(max_radius_, Radius(*body));
   broadphase_.Update(body, btVector3(0, 0, 0));
+  broadphase_.Commit();
 }
 
 // Not idempotent in the last bit, so it belongs where a velocity changes, not where a state is restored.
