@@ -114,6 +114,7 @@ uint64_t Region::StateHash() const {
   return sum;
 }
 
+int64_t Region::bodies() const { return static_cast<int64_t>(impl_->holdings.held.size()); }
 const RegionStats& Region::stats() const { return impl_->holdings.stats; }
 std::vector<Violation> Region::TakeViolations() { return std::exchange(impl_->holdings.violations, {}); }
 const Engine& Region::engine() const { return *impl_->holdings.engine; }

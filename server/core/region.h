@@ -103,6 +103,8 @@ class Region {
   // Sum over these bodies of a hash of (id, hash): add the regions' values to get the world's (I6).
   uint64_t StateHash() const;
 
+  // Bodies owned, announced spawns included. Constant time.
+  int64_t bodies() const;
   const RegionStats& stats() const;
   // Since the last call, at most 64.
   std::vector<Violation> TakeViolations();

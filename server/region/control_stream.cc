@@ -1,4 +1,5 @@
 #include "server/region/control_stream.h"
+#include "server/core/limits.h"
 
 #include <chrono>
 #include <utility>
@@ -27,6 +28,7 @@ Event EventQueue::Pop() {
 ControlStream::ControlStream(const std::string& address, v1::Hello hello, EventQueue* events) : events_(events) {
   grpc::ChannelArguments arguments;
   arguments.SetInt(GRPC_ARG_ENABLE_HTTP_PROXY, 0);
+  arguments.SetMaxReceiveMessageSize(limits::kMaxWorldFileBytes);  // an assignment holds the whole world
   stub_ = v1::Control::NewStub(grpc::CreateCustomChannel(address, grpc::InsecureChannelCredentials(), arguments));
   stub_->async()->Join(&context_, this);
   AddHold();  // writes come from outside of gRPC's callbacks; released when nothing is read any more

@@ -45,7 +45,7 @@ int main(int argc, char** argv) {
   aureole::BlockSignals();
   if (exit_with_parent) {
     const pid_t parent = getppid();
-    prctl(PR_SET_PDEATHSIG, SIGTERM);
+    prctl(PR_SET_PDEATHSIG, SIGKILL);   // even if it is stopped
     if (getppid() != parent) return 0;  // it has died already
   }
   spdlog::set_default_logger(spdlog::stderr_logger_mt("aureole-region"));

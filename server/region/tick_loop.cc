@@ -143,7 +143,7 @@ void TickLoop::EndLap() {
 
 void TickLoop::AfterTick() {
   const Tick n = region_->tick();
-  const int64_t bodies = region_->engine().Counts().bodies;
+  const int64_t bodies = region_->bodies();
   body_ticks_ += bodies;
   away_body_ticks_ += region_->stats().away_bodies;
   if ((options_.hash_every > 0 && n % options_.hash_every == 0) || n == options_.last_tick) {
@@ -176,7 +176,7 @@ void TickLoop::Report(const std::vector<RegionId>& waiting_for, bool finished) {
   const double wall_us = 1e3 * Ms(now - reported_at_);
   const auto simulated_us = static_cast<double>((region_->tick() - reported_tick_) * world_.environment.tick_us);
   r.set_tick(region_->tick());
-  r.set_bodies(counts.bodies);
+  r.set_bodies(region_->bodies());
   r.set_awake(counts.awake);
   r.set_real_time_factor(wall_us > 0 ? simulated_us / wall_us : 0);
   *r.mutable_frame() = Summarise(&frames_since_report_);

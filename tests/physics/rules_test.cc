@@ -75,6 +75,24 @@ TEST_F(SweepRule, TiesGoToTheSmallerIdInEveryOrderOfCreation) {
   }
 }
 
+// While boxes change one by one, a pair seems to part that does not; its contacts must outlive that.
+TEST(Contacts, OfBodiesThatFlyTogetherLiveOn) {
+  BulletWorld world(std::make_shared<Surroundings>(Weightless()), 16);
+  for (BodyId id : {7, 8}) {  // 7 flies ahead and is updated first
+    BodySpec b = At(id, CapsuleShape(0.5, 1), Vec3(id == 7 ? 0.98 : 0, 0, 0));
+    b.velocity = Vec3(80, 0, 0);
+    world.Add(world.StateOf(b));
+  }
+  for (Tick n = 1; n <= 3; ++n) {
+    world.Step(n);
+    ASSERT_EQ(world.Find(7)->pairs.size(), 1u);
+    std::vector<Manifold> manifolds;
+    world.contacts().List(*world.Find(7)->pairs[0], &manifolds);
+    ASSERT_EQ(manifolds.size(), 1u);
+    EXPECT_EQ(manifolds[0].points->getContactPoint(0).getLifeTime(), n);
+  }
+}
+
 // Each of two bodies that are shot at each other sees the other where it was at the start of the tick: they meet, and
 // the outcome is symmetric (L7).
 TEST(Sweep, SeesBodiesWhereTheyWere) {

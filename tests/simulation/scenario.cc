@@ -192,6 +192,43 @@ struct Builder {
     }
   }
 
+  // Pairs that meet head-on at full speed near a border: the narrowest test of a margin. Some of the partners appear
+  // only when the other one is almost there.
+  void Duels(int n, Tick ticks) {
+    for (int i = 0; i < n; ++i) {
+      const double z = 6.0 * (i - n / 2), speed = kSpeed * (1 - 1e-9), dt = world.environment.dt();
+      const bool spawned = rng.Chance(0.4);
+      auto shape = std::make_shared<Shape>();
+      shape->radius = 0.1;
+      BodySpec a = placer.Body(shape), b = placer.Body(shape);
+      const double meet = rng.In(-1.5, 1.5), t = rng.In(12, 30) * dt, y = toy ? 0 : 0.5;
+      a.velocity = {speed, 0, 0};
+      b.velocity = {-speed, 0, 0};
+      if (rng.Chance(0.5)) std::swap(a.velocity, b.velocity);
+      a.position = Vec3(meet, y, z) - a.velocity * t - a.velocity.normalized() * 0.1;
+      b.position = Vec3(meet, y, z) - b.velocity * t - b.velocity.normalized() * 0.1;
+      Add(a);
+      if (!spawned) {
+        Add(b);
+        continue;
+      }
+      auto late = std::make_shared<BodySpec>(b);
+      Input in;
+      in.kind = Input::Kind::kSpawn;
+      in.tick = 8 * world.exchange.k + 1 + rng.Below(static_cast<int>(ticks / 3));
+      // Less than a tick before they meet, wherever the first one is then.
+      const double before = rng.In(0, 1) * dt, travelled = static_cast<double>(in.tick - 1) * dt;
+      late->position =
+          a.position + a.velocity * (travelled + before) + a.velocity.normalized() * 0.2 - b.velocity * before;
+      const double shift = late->position.x() - meet;  // so that it happens near the border
+      late->position.x() -= shift;
+      world.bodies.back().position.x() -= shift;
+      in.body = late->id;
+      in.spawn = late;
+      world.script.push_back(in);
+    }
+  }
+
   // A nearly touching heap on a border.
   void Heap(int n) {
     const Vec3 centre = NearBorder(0.3);
@@ -429,7 +466,7 @@ void AddLive(Scenario* s, int n, Random& rng) {
 }  // namespace
 
 const std::vector<std::string>& Scenes() {
-  static const std::vector<std::string> names{"burst", "heap", "cradle", "scatter", "drift", "stir"};
+  static const std::vector<std::string> names{"burst", "heap", "cradle", "scatter", "drift", "duels", "stir"};
   return names;
 }
 
@@ -475,6 +512,7 @@ Scenario MakeScenario(uint64_t seed, const ScenarioOptions& options, const Engin
   Builder build(s.world, rng, options.toy, width);
   const int size = options.toy ? 1 + rng.Below(3) : 3;
   if (s.scene == "burst") build.Burst(size * (4 + rng.Below(6)));
+  if (s.scene == "duels") build.Duels(6, s.ticks);
   if (s.scene == "heap") build.Heap(size * (8 + rng.Below(16)));
   if (s.scene == "cradle") build.Cradle(4 + size * rng.Below(5));
   if (s.scene == "scatter") build.Scatter(size * (5 + rng.Below(8)));
@@ -491,7 +529,10 @@ Scenario MakeScenario(uint64_t seed, const ScenarioOptions& options, const Engin
   if (rng.Chance(0.4)) build.AddSpawns(1 + rng.Below(size * 4), s.ticks);
   if (rng.Chance(0.2)) build.AddRemovals(1 + rng.Below(2), s.ticks);
   SortScript(&s.world);
-  const double rate = s.scene == "drift" ? 0.01 : rng.Chance(0.3) ? 0 : rng.Chance(0.5) ? 0.02 : 0.12;
+  const double rate = s.scene == "drift"                      ? 0.01
+                      : s.scene == "duels" || rng.Chance(0.3) ? 0
+                      : rng.Chance(0.5)                       ? 0.02
+                                                              : 0.12;
   Aim(&s, build.stirred ? 0.06 : options.toy ? rate : rate / 4, build.top_speed, build.stirred, rng, make_engine);
   if (rng.Chance(0.2)) AddLive(&s, 1 + rng.Below(10), rng);
   return s;

@@ -1,6 +1,8 @@
 #include "server/core/region.h"
 
 #include <array>
+#include <map>
+#include <vector>
 
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
@@ -80,6 +82,75 @@ TEST(Region, BodyThatWentHomeDoesNotComeBackAtOnce) {
   s.RunTo(60);
   EXPECT_EQ(s.Owner(1), 1);
   EXPECT_EQ(s.BodiesMoved(), 1);
+}
+
+// Bodies 1 and 2 meet on the border and are one component from then on.
+World Meeting(double mass_of_1) {
+  World w = TwoColumns();
+  w.bodies = {Ball(1, -0.25), Ball(2, 1.05, -10)};
+  w.bodies[0].mass = mass_of_1;
+  return w;
+}
+
+TEST(Region, TieGoesToTheBetterRank) {
+  for (RegionId better : {0, 1}) {
+    World w = Meeting(1);
+    ASSERT_TRUE(w.layout.SetRanks(better == 0 ? std::vector<int>{0, 1} : std::vector<int>{1, 0}).ok());
+    Lockstep s(w);
+    for (Tick n = 1; n < 20 && s.BodiesMoved() == 0; ++n) s.RunTo(n);
+    EXPECT_EQ(s.BodiesMoved(), 1);
+    EXPECT_EQ(s.Owner(1), better);
+    EXPECT_EQ(s.Owner(2), better);
+  }
+}
+
+TEST(Region, IslandStaysForItsDwell) {
+  World w = Meeting(100);
+  w.exchange.dwell = 40;
+  Lockstep s(w);
+  Tick n = 0, came = 0;
+  while (n < 20 && s.Owner(2) != 0) s.RunTo(++n);
+  came = n;
+  ASSERT_EQ(s.Owner(2), 0) << "body 1 is the heavier one";
+  while (n < 100 && s.Owner(2) == 0) s.RunTo(++n);
+  EXPECT_EQ(n - came, 40) << "it bounces back at once, and is alone in its home all the time";
+}
+
+std::map<BodyId, Epoch> Epochs(Lockstep& s) {
+  std::map<BodyId, Epoch> epochs;
+  for (RegionId r : {0, 1}) {
+    std::vector<BodyRecord> records;
+    s.region(r).Observe(&records);
+    for (const BodyRecord& b : records) epochs[b.id] = b.epoch;
+  }
+  return epochs;
+}
+
+TEST(Region, EpochCountsTheChangesOfOwner) {
+  World w = Meeting(100);
+  Lockstep s(w);
+  EXPECT_EQ(Epochs(s), (std::map<BodyId, Epoch>{{1, 0}, {2, 0}}));
+  s.RunTo(40);
+  EXPECT_EQ(s.Owner(2), 1) << "it went and came back";
+  EXPECT_EQ(Epochs(s), (std::map<BodyId, Epoch>{{1, 0}, {2, 2}}));
+}
+
+TEST(Region, InputsOfOneTickApplyInTheirOrder) {
+  World w = TwoColumns();
+  w.bodies = {Ball(1, -5)};
+  Lockstep s(w);
+  s.RunTo(10);
+  for (uint64_t source : {2, 1}) {  // the second one comes first
+    Input in;
+    in.kind = source == 1 ? Input::Kind::kVelocity : Input::Kind::kImpulse;
+    in.source = source;
+    in.sequence = 1;
+    in.body = 1;
+    in.linear = {source == 1 ? 5.0 : 2.0, 0, 0};
+    ASSERT_EQ(*s.region(0).Submit(in), 11);
+  }
+  s.RunTo(11);
+  EXPECT_DOUBLE_EQ(s.region(0).engine().View(1).velocity.x(), 7.0) << "set to 5, then 2 more";
 }
 
 TEST(Region, FrameOfAStrangerIsRefusedWithAReasonAndChangesNothing) {
