@@ -425,8 +425,9 @@ void Aim(Scenario* scenario, double rate, double top_speed, const std::optional<
         }
       }
       if (stirred) {
-        const Vec3 to = *stirred + Vec3(rng.In(-3, 3), 0, rng.In(-8, 8)) - me.centre;
-        velocity = Vec3(to.x() * 2, 0, to.z() * 0.5);
+        const double side = (n / 50 + static_cast<Tick>(id)) % 2 == 0 ? 2.5 : -2.5;
+        const Vec3 to = *stirred + Vec3(side + rng.In(-1, 1), 0, rng.In(-8, 8)) - me.centre;
+        velocity = Vec3(to.x() * 2, 0, to.z() * 0.3);
         if (velocity.norm() > 12) velocity *= 12 / velocity.norm();
         velocity.y() = scenario->world.environment.gravity.y() < 0 ? rng.In(0, 2) : 0;
       }
@@ -518,11 +519,11 @@ Scenario MakeScenario(uint64_t seed, const ScenarioOptions& options, const Engin
   if (s.scene == "scatter") build.Scatter(size * (5 + rng.Below(8)));
   if (s.scene == "stir") {
     build.Stir(options.toy ? 15 + rng.Below(30) : 40 + rng.Below(60));
-    s.ticks = options.toy ? 150 : 750;
+    s.ticks = options.toy ? 150 : 800;
   }
   if (s.scene == "drift") build.Drift(size * (6 + rng.Below(9)));
   if (build.stirred) {
-    build.AddJoints(static_cast<int>(s.world.bodies.size()) / 6);
+    build.AddJoints(static_cast<int>(s.world.bodies.size()) / 4);
   } else if (rng.Chance(0.4)) {
     build.AddJoints(1 + rng.Below(2));
   }
@@ -533,7 +534,7 @@ Scenario MakeScenario(uint64_t seed, const ScenarioOptions& options, const Engin
                       : s.scene == "duels" || rng.Chance(0.3) ? 0
                       : rng.Chance(0.5)                       ? 0.02
                                                               : 0.12;
-  Aim(&s, build.stirred ? 0.06 : options.toy ? rate : rate / 4, build.top_speed, build.stirred, rng, make_engine);
+  Aim(&s, build.stirred ? 0.12 : options.toy ? rate : rate / 4, build.top_speed, build.stirred, rng, make_engine);
   if (rng.Chance(0.2)) AddLive(&s, 1 + rng.Below(10), rng);
   return s;
 }
