@@ -27,8 +27,8 @@ struct Aura {
   WireBox box;  // k = 0: the exact box. k >= 1: the box of the bounding sphere, which turning does not change
   // k >= 1 only.
   RegionId owner = kNoRegion;  // after the decisions of the frame's tick
-  // `reach` policy only (R12): the contact group that may strike the body within the horizon and the exchange, the group's
-  // kinetic energy then at most, in J (rounded up), and the body's own mass in kg (rounded down).
+  // `reach` policy only (R12): the contact group that may strike the body within the horizon and the exchange, the
+  // group's kinetic energy then at most, in J (rounded up), and the body's own mass in kg (rounded down).
   BodyId group = 0;
   float energy = 0;
   float mass = 0;

@@ -204,10 +204,10 @@ void Holdings::CountHomes(std::span<const BodyId> near) {
     if (!engine->Contains(id)) continue;
     const RegionId home = world.layout.Home(engine->View(id).centre);
     while (before != homes_.end() && before->first < id) ++before;
-    // Not in the list: it was inside its home, or it has arrived, and the sender has counted.
+    // Not in the list: it was inside its home, or it has arrived and the sender has counted, or it began where it is.
     if (before != homes_.end() && before->first == id) {
       stats.home_crossings += before->second != home;
-    } else if (held.at(id).arrived < tick) {
+    } else if (tick > 0 && held.at(id).arrived < tick) {
       stats.home_crossings += home != self;
     }
     stats.away_bodies += home != self;

@@ -55,6 +55,18 @@ TEST(ClusterSimulation, CornersAndNarrowCellsHoldInTheSynchronousExchange) {
   }
 }
 
+// R12: a struck row hands the speed, and light bodies more than that, to its far end in one tick.
+TEST(ClusterSimulation, StruckRowsHoldInTheReachPolicy) {
+  ScenarioOptions options;
+  options.policy = AuraPolicy::kReach;
+  options.scene = "cradle";
+  for (int k : {1, 2, 3}) {
+    options.k = k;
+    const Sum sum = RunSeeds(10000, 200, options, Faults::None());
+    EXPECT_EQ(sum.bad, 0) << "k " << k << ": " << sum.first;
+  }
+}
+
 TEST(ClusterSimulation, TheNetworkChangesNoBit) {
   for (uint64_t seed = 1; seed <= 60; ++seed) {
     const Scenario s = MakeScenario(seed, {}, MakeToyEngine);
