@@ -2,11 +2,9 @@
 
 #include <google/protobuf/io/coded_stream.h>
 #include <google/protobuf/io/zero_copy_stream_impl_lite.h>
-#include <unistd.h>
 
 #include <algorithm>
 #include <filesystem>
-#include <fstream>
 #include <iostream>
 #include <map>
 
@@ -17,56 +15,22 @@
 #include "client/cli/exit_codes.h"
 #include "client/cli/experiment_report.h"
 #include "client/cli/flags.h"
-#include "server/control/interrupts.h"
-#include "server/control/local_allocator.h"
+#include "client/cli/measured_runs.h"
+#include "client/cli/output_directory.h"
+#include "client/cli/policies.h"
 #include "server/control/run.h"
 #include "server/control/world_file.h"
 
 namespace aureole {
 namespace {
 
-using Clock = std::chrono::steady_clock;
-
 constexpr Tick kHashEvery = 100;
-
-// Where a run is, on stderr: one line in place on a terminal, else a line every five seconds.
-class Progress {
- public:
-  Progress(std::string name, Tick last_tick, int64_t tick_us)
-      : name_(std::move(name)), last_tick_(last_tick), tick_s_(static_cast<double>(tick_us) * 1e-6) {}
-  ~Progress() {
-    if (terminal_ && shown_) std::cerr << "\r\x1b[K" << std::flush;
-  }
-
-  void Show(const RunStatus& status) {
-    const auto now = Clock::now();
-    if (now < next_) return;
-    next_ = now + (terminal_ ? std::chrono::milliseconds(500) : std::chrono::milliseconds(5000));
-    shown_ = true;
-    const Tick tick = status.MinTick();
-    std::string line = absl::StrFormat("%s: %.1f of %.1f s, %d bodies", name_, static_cast<double>(tick) * tick_s_,
-                                       static_cast<double>(last_tick_) * tick_s_, status.Bodies());
-    for (const std::string& w : status.Waiting()) absl::StrAppend(&line, "; ", w);
-    if (terminal_) {
-      std::cerr << "\r" << line.substr(0, 150) << "\x1b[K" << std::flush;
-    } else {
-      std::cerr << line << '\n';
-    }
-  }
-
- private:
-  const std::string name_;
-  const Tick last_tick_;
-  const double tick_s_;
-  const bool terminal_ = isatty(STDERR_FILENO) != 0;
-  bool shown_ = false;
-  Clock::time_point next_{};
-};
+constexpr double kDefaultDuration = 60;  // s
 
 class Experimenter {
  public:
   explicit Experimenter(const ExperimentOptions& options) : options_(options) {
-    experiment_.duration_s = options.duration_s;
+    experiment_.duration_s = options.duration_s > 0 ? options.duration_s : kDefaultDuration;
     experiment_.repeat = options.repeat;
     experiment_.real_time = !options.no_real_time;
     experiment_.hash_every = kHashEvery;
@@ -75,7 +39,7 @@ class Experimenter {
   // Appends the row of one world, running its undivided reference first when nobody has.
   absl::Status Add(const WorldFile& file) {
     const int64_t tick_us = file.world.environment.tick_us;
-    const Tick last_tick = TicksIn(options_.duration_s, tick_us);
+    const Tick last_tick = TicksIn(experiment_.duration_s, tick_us);
     const std::string key = ContentKey(file.spec);
     if (!references_.contains(key)) {
       const absl::StatusOr<std::vector<RunMeasure>> runs = Repeat(file, true, last_tick);
@@ -112,44 +76,16 @@ class Experimenter {
     return spec.layout().has_columns() ? Figure::kColumns : Figure::kCorners;
   }
 
-  // The first repeat that differs speaks for all.
-  static Comparison CompareAll(const std::vector<RunMeasure>& runs, const RunMeasure& reference, Tick last_tick) {
-    Comparison worst = Compare(runs.front(), reference, last_tick);
-    for (const RunMeasure& run : runs) {
-      const Comparison c = Compare(run, reference, last_tick);
-      if (worst.hash_equal && !c.hash_equal) worst = c;
-      worst.lost = std::max(worst.lost, c.lost);
-      worst.doubled = std::max(worst.doubled, c.doubled);
-    }
-    return worst;
-  }
-
   absl::StatusOr<std::vector<RunMeasure>> Repeat(const WorldFile& file, bool undivided, Tick last_tick) {
-    std::vector<RunMeasure> out;
-    for (int i = 0; i < options_.repeat; ++i) {
-      std::string name = absl::StrCat(file.world.name, undivided ? ", undivided" : "");
-      if (options_.repeat > 1) absl::StrAppendFormat(&name, ", %d of %d", i + 1, options_.repeat);
-      RunOptions run;
-      run.world = file.spec;
-      run.regions = file.world.layout.size();
-      run.undivided = undivided;
-      run.no_real_time = options_.no_real_time;
-      run.last_tick = last_tick;
-      run.hash_every = kHashEvery;
-      LocalAllocator allocator({options_.region_server, "", false});
-      RunResult result;
-      Progress progress(name, last_tick, file.world.environment.tick_us);
-      const absl::Status s = RunWorld(
-          run, allocator,
-          [&progress](const RunStatus& status) {
-            progress.Show(status);
-            return Interrupts() == 0;
-          },
-          &result);
-      if (!s.ok()) return absl::Status(s.code(), absl::StrCat(name, ": ", s.message()));
-      out.push_back(Measure(result, file.world.environment.tick_us));
-    }
-    return out;
+    RunOptions run;
+    run.world = file.spec;
+    run.regions = file.world.layout.size();
+    run.undivided = undivided;
+    run.no_real_time = options_.no_real_time;
+    run.last_tick = last_tick;
+    run.hash_every = kHashEvery;
+    return MeasuredRuns(absl::StrCat(file.world.name, undivided ? ", undivided" : ""), run,
+                        file.world.environment.tick_us, options_.repeat, options_.region_server);
   }
 
   const ExperimentOptions& options_;
@@ -157,19 +93,12 @@ class Experimenter {
   std::map<std::string, size_t> references_;  // by content
 };
 
-absl::Status Write(const std::filesystem::path& path, const std::string& text) {
-  std::ofstream out(path, std::ios::binary | std::ios::trunc);
-  out << text;
-  out.close();
-  return out ? absl::OkStatus() : absl::InternalError(absl::StrCat("cannot write ", path.string()));
-}
-
 absl::Status WriteAll(const Experiment& experiment, const std::filesystem::path& directory) {
-  absl::Status s = Write(directory / "experiment.json", ToJson(experiment).dump(2) + "\n");
-  s.Update(Write(directory / "experiment.csv", ToCsv(experiment)));
+  absl::Status s = WriteText(directory / "experiment.json", ToJson(experiment).dump(2) + "\n");
+  s.Update(WriteText(directory / "experiment.csv", ToCsv(experiment)));
   const std::string columns = ToSvg(experiment, Figure::kColumns), corners = ToSvg(experiment, Figure::kCorners);
-  if (!columns.empty()) s.Update(Write(directory / "columns.svg", columns));
-  if (!corners.empty()) s.Update(Write(directory / "corners.svg", corners));
+  if (!columns.empty()) s.Update(WriteText(directory / "columns.svg", columns));
+  if (!corners.empty()) s.Update(WriteText(directory / "corners.svg", corners));
   return s;
 }
 
@@ -192,14 +121,16 @@ std::string ContentKey(const v1::WorldSpec& spec) {
 
 CLI::App* AddExperiment(CLI::App& app, ExperimentOptions* o) {
   CLI::App* e = app.add_subcommand("experiment", "Measure worlds split over servers, each beside the undivided world");
-  e->add_option("worlds", o->worlds, "World files (JSON)")->required()->type_name("FILE");
+  CLI::Option* worlds = e->add_option("worlds", o->worlds, "World files (JSON)")->type_name("FILE");
+  e->add_flag("--policies", o->policies, "Instead of worlds: compare the exchanges in crowds of 0.05 to 1 bodies/m2")
+      ->excludes(worlds);
   e->add_option("--seed", o->seed, "Instead of the worlds' own seeds");
-  AddDuration(e, &o->duration_s, "Simulated time of each run; 60s when not given");
+  AddDuration(e, &o->duration_s, "Simulated time of each run; when not given 60s, with --policies 20s");
   e->add_option("--repeat", o->repeat, "Runs of each world; frame times are their means")
       ->capture_default_str()
       ->check(CLI::Range(1, 1000));
-  e->add_flag("--no-real-time", o->no_real_time, "As fast as it can, not at the world's tick");
-  e->add_option("--out", o->out, "Directory for experiment.csv, experiment.json, columns.svg and corners.svg")
+  e->add_flag("--no-real-time", o->no_real_time, "As fast as it can, not at the world's tick; --policies always does");
+  e->add_option("--out", o->out, "Directory for the results: CSV, JSON and, of worlds, SVG")
       ->capture_default_str()
       ->type_name("DIR");
   e->add_flag("--json", o->json, "Print the JSON instead of the table");
@@ -208,7 +139,8 @@ CLI::App* AddExperiment(CLI::App& app, ExperimentOptions* o) {
   e->footer(
       std::string("Examples:\n"
                   "  aureole experiment tests/worlds/paper/column-*.json --out columns\n"
-                  "  aureole experiment tests/worlds/paper/corner-{1,4,9}.json --no-real-time --duration 20s\n\n"
+                  "  aureole experiment tests/worlds/paper/corner-{1,4,9}.json --no-real-time --duration 20s\n"
+                  "  aureole experiment --policies --out policies\n\n"
                   "Every world runs on real processes, one server per region, and once undivided; worlds that differ\n"
                   "only in layout share that run, and a world of one region is it. The figures follow the paper's\n"
                   "Figs. 5 and 7: the maximum frame time of any server in each 5 s of simulated time.\n\n") +
@@ -217,6 +149,11 @@ CLI::App* AddExperiment(CLI::App& app, ExperimentOptions* o) {
 }
 
 int RunExperiment(const ExperimentOptions& options) {
+  if (options.policies) return RunPolicies(options);
+  if (options.worlds.empty()) {
+    std::cerr << "worlds: name at least one world file, or give --policies\n";
+    return kExitBadInput;
+  }
   std::vector<WorldFile> files;
   for (const std::string& path : options.worlds) {
     absl::StatusOr<WorldFile> file = OpenWorldFile(path, options.seed);
@@ -226,10 +163,8 @@ int RunExperiment(const ExperimentOptions& options) {
     }
     files.push_back(*std::move(file));
   }
-  std::error_code error;
-  std::filesystem::create_directories(options.out, error);
-  if (error || access(options.out.c_str(), W_OK) != 0) {
-    std::cerr << "--out: cannot write to " << options.out << (error ? ": " + error.message() : "") << '\n';
+  if (const absl::Status s = MakeOutputDirectory(options.out); !s.ok()) {
+    std::cerr << s.message() << '\n';
     return kExitBadInput;
   }
 

@@ -14,8 +14,9 @@ namespace aureole {
 
 struct ExperimentOptions {
   std::vector<std::string> worlds;
+  bool policies = false;  // the table of policies.h instead of worlds
   std::optional<uint64_t> seed;
-  double duration_s = 60;
+  double duration_s = 0;  // 0: as the command's help says
   int repeat = 1;
   bool no_real_time = false;
   bool json = false;

@@ -27,6 +27,18 @@ void Add(const v1::Window& w, RegionId region, WindowSum* sum) {
   sum->ticks = std::max(sum->ticks, w.process_cpu().ticks());
 }
 
+// Of the whole run.
+void AddFrames(const std::vector<v1::Window>& windows, RegionMeasure* region) {
+  int64_t ticks = 0;
+  double sum_ms = 0;
+  for (const v1::Window& w : windows) {
+    ticks += w.process_cpu().ticks();
+    sum_ms += w.process_cpu().mean_ms() * static_cast<double>(w.process_cpu().ticks());
+    region->max_frame_ms = std::max(region->max_frame_ms, w.process_cpu().max_ms());
+  }
+  if (ticks > 0) region->mean_frame_ms = sum_ms / static_cast<double>(ticks);
+}
+
 }  // namespace
 
 double RunMeasure::AwayFromHome() const {
@@ -67,7 +79,9 @@ RunMeasure Measure(const RunResult& result, int64_t tick_us) {
       for (const v1::Window& w : result.windows[r]) {
         if (w.index() == last_window) region.last_max_frame_ms = w.process_cpu().max_ms();
       }
+      AddFrames(result.windows[r], &region);
     }
+    region.body_ticks = report.body_ticks();
     out.regions.push_back(region);
     out.bodies += report.bodies();
     out.violations += report.violations();
@@ -106,6 +120,8 @@ RunMeasure MeanOf(std::span<const RunMeasure> repeats) {
     }
     for (size_t r = 0; r < out.regions.size() && r < m.regions.size(); ++r) {
       out.regions[r].last_max_frame_ms += m.regions[r].last_max_frame_ms;
+      out.regions[r].mean_frame_ms += m.regions[r].mean_frame_ms;
+      out.regions[r].max_frame_ms += m.regions[r].max_frame_ms;
     }
     out.violations = std::max(out.violations, m.violations);
     out.wall_seconds += m.wall_seconds;
@@ -114,7 +130,9 @@ RunMeasure MeanOf(std::span<const RunMeasure> repeats) {
   for (WindowMeasure& w : out.windows) {
     for (double* v : {&w.max_frame_ms, &w.mean_frame_ms, &w.max_thread_ms, &w.mean_thread_ms, &w.max_wall_ms}) *v /= n;
   }
-  for (RegionMeasure& r : out.regions) r.last_max_frame_ms /= n;
+  for (RegionMeasure& r : out.regions) {
+    for (double* v : {&r.last_max_frame_ms, &r.mean_frame_ms, &r.max_frame_ms}) *v /= n;
+  }
   out.wall_seconds /= n;
   return out;
 }
@@ -143,6 +161,18 @@ Comparison Compare(const RunMeasure& split, const RunMeasure& undivided, Tick la
   }
   if (!at_end) out.hash_equal = false;
   return out;
+}
+
+Comparison CompareAll(std::span<const RunMeasure> repeats, const RunMeasure& undivided, Tick last_tick) {
+  Comparison worst = Compare(repeats.front(), undivided, last_tick);
+  for (const RunMeasure& run : repeats.subspan(1)) {
+    const Comparison c = Compare(run, undivided, last_tick);
+    const int64_t lost = std::max(worst.lost, c.lost), doubled = std::max(worst.doubled, c.doubled);
+    if (worst.hash_equal && !c.hash_equal) worst = c;
+    worst.lost = lost;
+    worst.doubled = doubled;
+  }
+  return worst;
 }
 
 }  // namespace aureole

@@ -29,6 +29,8 @@ struct RegionMeasure {
   int64_t bodies = 0;            // at the end
   int64_t largest_cluster = 0;   // most bodies of one transfer it sent
   int64_t largest_component = 0, longest_chain = 0;
+  double mean_frame_ms = 0, max_frame_ms = 0;  // over the whole run
+  int64_t body_ticks = 0;                      // hosted
 };
 
 struct RunMeasure {
@@ -67,5 +69,8 @@ struct Comparison {
 
 // Compares the sums of a split run with those of the undivided one; `last_tick` is where both ended.
 Comparison Compare(const RunMeasure& split, const RunMeasure& undivided, Tick last_tick);
+
+// Of repeats of one run: the first that differs speaks for all. Precondition: not empty.
+Comparison CompareAll(std::span<const RunMeasure> repeats, const RunMeasure& undivided, Tick last_tick);
 
 }  // namespace aureole

@@ -9,6 +9,10 @@
 namespace aureole {
 namespace {
 
+// J. More than any body of limits.h has at any speed of limits.h: a larger bound says nothing new, and would overflow
+// the float32 of an aura.
+constexpr double kMostEnergy = 1e24;
+
 // Unites the groups of all pairs whose boxes, grown by what they may have moved, meet.
 void PoolNear(std::span<const ReachNode> nodes, std::vector<int>* order, UnionFind* groups) {
   order->resize(nodes.size());
@@ -50,7 +54,7 @@ void PropagateReach(std::span<ReachNode> nodes, std::vector<double>* energies,
       gained[n.group] += n.mass * dv * (speed + dv / 2);
       n.distance += next * limits.dt + limits.recovery;
     }
-    for (size_t g = 0; g < pooled.size(); ++g) (*energies)[g] = pooled[g] + gained[g];
+    for (size_t g = 0; g < pooled.size(); ++g) (*energies)[g] = std::min(pooled[g] + gained[g], kMostEnergy);
   }
 }
 

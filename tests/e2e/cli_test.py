@@ -204,6 +204,10 @@ class Input(Cli):
                             (["--frobnicate"], "--frobnicate")):
             self.assertIn(word, self.refused("up", demo, *flags))
         self.assertIn("--repeat", self.refused("experiment", demo, "--repeat", "0"))
+        self.assertIn("--policies", self.refused("experiment"))
+        self.assertIn("--policies", self.refused("experiment", demo, "--policies"))
+        self.assertIn("events: must be at most kMaxEvents",
+                      self.refused("experiment", "--policies", "--duration", "12m", "--out", self.path / "out"))
         blocked = self.path / "file"
         blocked.write_text("")
         self.assertIn("--out", self.refused("experiment", demo, "--out", blocked / "below"))
@@ -277,6 +281,20 @@ class Results(Cli):
         self.assertEqual(code, 1)
         runs = json.loads((self.path / "out" / "experiment.json").read_text())["runs"]
         self.assertEqual([r["lost"] for r in runs], [0, 1, 1])
+
+    def test_policies_are_compared_in_every_crowd(self):
+        code, out, err = self.run_cli("experiment", "--policies", "--duration", "1s", "--json", "--out",
+                                      self.path / "out", *self.fake())
+        self.assertEqual(code, 0, err)
+        self.assertEqual(sorted(p.name for p in (self.path / "out").iterdir()), ["policies.csv", "policies.json"])
+        result = json.loads(out)
+        self.assertEqual(result, json.loads((self.path / "out" / "policies.json").read_text()))
+        self.assertEqual([(s["kicks"], s["density"]) for s in result["scenes"]],
+                         [(k, d) for k in ("slow", "fast") for d in (0.05, 0.2, 0.5, 1)])
+        for scene in result["scenes"]:
+            self.assertEqual([(r["policy"], r["exchange_delay"]) for r in scene["runs"]],
+                             [(None, 0), ("reach", 1), ("reach", 2), ("tolerance", 1), ("tolerance", 2)])
+            self.assertTrue(all(r["hash_equal"] for r in scene["runs"]), scene)
 
     def test_interrupted_experiment_leaves_no_server(self):
         process = self.start("experiment", WORLDS / "paper" / "column-4.json", "--out", self.path / "out",

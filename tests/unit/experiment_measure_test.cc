@@ -43,6 +43,34 @@ TEST(ExperimentMeasure, WindowIsTheWorstServerOfEach) {
   EXPECT_EQ(m.regions[1].last_max_frame_ms, 6);
 }
 
+TEST(ExperimentMeasure, FramesOfARegionAreThoseOfTheWholeRun) {
+  RunResult result;
+  result.status.regions.resize(2);
+  result.status.regions[1].report.set_body_ticks(70);
+  result.windows = {{Window(0, 3, 2, 300), Window(1, 99, 6, 100)}, {Window(0, 5, 1)}};
+  const RunMeasure m = Measure(result, 16000);
+  EXPECT_DOUBLE_EQ(m.regions[0].mean_frame_ms, 3) << "each tick counts alike";
+  EXPECT_EQ(m.regions[0].max_frame_ms, 99);
+  EXPECT_EQ(m.regions[1].mean_frame_ms, 1);
+  EXPECT_EQ(m.regions[1].body_ticks, 70);
+  RunMeasure slower = m;
+  slower.regions[0].mean_frame_ms = 5;
+  slower.regions[0].max_frame_ms = 1;
+  const RunMeasure mean = MeanOf(std::vector{m, slower});
+  EXPECT_DOUBLE_EQ(mean.regions[0].mean_frame_ms, 4);
+  EXPECT_DOUBLE_EQ(mean.regions[0].max_frame_ms, 50);
+}
+
+TEST(ExperimentMeasure, RepeatThatDiffersSpeaksForAll) {
+  const RunMeasure want = WithSums(1, {Sum(100, 5, 10, 1)});
+  const RunMeasure same = WithSums(1, {Sum(100, 5, 10, 1)}), other = WithSums(1, {Sum(100, 6, 9, 1)});
+  EXPECT_TRUE(CompareAll(std::vector{same, same}, want, 100).hash_equal);
+  const Comparison c = CompareAll(std::vector{same, other, same}, want, 100);
+  EXPECT_FALSE(c.hash_equal);
+  EXPECT_EQ(c.first_difference, 100);
+  EXPECT_EQ(c.lost, 1);
+}
+
 TEST(ExperimentMeasure, LastWindowThatTheRunHardlyFilledIsLeftOut) {
   RunResult result;
   result.status.regions.resize(1);
