@@ -6,7 +6,7 @@
 #include <string>
 
 #include "aureole/v1/world.pb.h"
-#include "server/core/types.h"
+#include "server/control/world_file.h"
 
 namespace aureole {
 

@@ -11,7 +11,6 @@
 #include "client/cli/measured_runs.h"
 #include "client/cli/output_directory.h"
 #include "server/control/world_file.h"
-#include "server/transport/world_spec.h"
 
 namespace aureole {
 namespace {
@@ -44,7 +43,7 @@ class PolicyRuns {
   // InvalidArgument when the largest of the crowds could not run so long.
   absl::Status Check() const {
     const Tick ticks = TicksIn(table_.duration_s, kCrowdTickUs);
-    return WorldFromSpec(CrowdWorld({1, true, table_.seed, ticks})).status();
+    return CheckWorld(CrowdWorld({1, true, table_.seed, ticks}));
   }
 
   const PolicyTable& table() const { return table_; }

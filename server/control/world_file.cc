@@ -63,6 +63,8 @@ absl::StatusOr<WorldFile> OpenWorldFile(const std::string& path, std::optional<u
   return WorldFile{path, *std::move(spec), *std::move(world)};
 }
 
+absl::Status CheckWorld(const v1::WorldSpec& spec) { return WorldFromSpec(spec).status(); }
+
 std::vector<std::string> DescribeWorld(const World& world) {
   std::vector<std::string> out;
   const int regions = world.layout.size();

@@ -22,6 +22,9 @@ struct WorldFile {
 // NotFound: it cannot be read. InvalidArgument: it is not a world that could run.
 absl::StatusOr<WorldFile> OpenWorldFile(const std::string& path, std::optional<uint64_t> seed = std::nullopt);
 
+// Why it is not a world that could run, as OpenWorldFile would say.
+absl::Status CheckWorld(const v1::WorldSpec& spec);
+
 // What a person wants to know of a world before running it, a line each: regions, bodies, the layout's chain number m,
 // the paper's aura (Eqs. 1-4) and our margins (PROTOCOL.md section 1) side by side.
 std::vector<std::string> DescribeWorld(const World& world);
