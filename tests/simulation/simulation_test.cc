@@ -67,6 +67,20 @@ TEST(ClusterSimulation, StruckRowsHoldInTheReachPolicy) {
   }
 }
 
+// Few of the worlds above meet what costs the fixed delay most: strangers deep in another region, pairs at top speed.
+TEST(ClusterSimulation, HeapsAndDuelsHoldInTheTolerancePolicy) {
+  ScenarioOptions options;
+  options.policy = AuraPolicy::kTolerance;
+  for (const char* scene : {"heap", "duels"}) {
+    options.scene = scene;
+    for (int k : {1, 2}) {
+      options.k = k;
+      const Sum sum = RunSeeds(10000, 150, options, Faults::None());
+      EXPECT_EQ(sum.bad, 0) << scene << ", k " << k << ": " << sum.first;
+    }
+  }
+}
+
 TEST(ClusterSimulation, TheNetworkChangesNoBit) {
   for (uint64_t seed = 1; seed <= 60; ++seed) {
     const Scenario s = MakeScenario(seed, {}, MakeToyEngine);
