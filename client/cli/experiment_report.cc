@@ -58,7 +58,7 @@ Json RowJson(const Row& row, const Experiment& experiment) {
               {"violations", m.violations},
               {"transfers", m.transfers},
               {"touching_transfers", m.touching_transfers},
-              {"slack_at_first_touch", nullptr},
+              {"slack_at_first_touch", nullptr},  // not measured
               {"largest_cluster", m.largest_cluster},
               {"largest_component", m.largest_component},
               {"longest_chain", m.longest_chain},
@@ -75,8 +75,6 @@ Json RowJson(const Row& row, const Experiment& experiment) {
               {"windows", WindowsJson(m)},
               {"servers", RegionsJson(m)}};
   if (row.comparison.first_difference > 0) out["first_difference"] = row.comparison.first_difference;
-  // With delay 0 nothing is predicted, so there is no slack to measure.
-  if (row.exchange_delay > 0 && m.transfers > 0) out["slack_at_first_touch"] = {{"min", m.slack_min}};
   if (const auto moves = m.TransfersPerHomeCrossing()) out["transfers_per_home_crossing"] = *moves;
   return out;
 }

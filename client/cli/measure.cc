@@ -66,7 +66,6 @@ RunMeasure Measure(const RunResult& result, int64_t tick_us) {
   for (const auto& [index, sum] : windows) out.windows.push_back(sum.measure);
   const int64_t last_window = windows.empty() ? -1 : windows.rbegin()->first;
 
-  bool any_slack = false;
   for (size_t r = 0; r < result.status.regions.size(); ++r) {
     const v1::Report& report = result.status.regions[r].report;
     RegionMeasure region;
@@ -97,10 +96,6 @@ RunMeasure Measure(const RunResult& result, int64_t tick_us) {
     out.bytes_sent += report.bytes_sent();
     out.waits += report.waits();
     out.wait_us += report.wait_us();
-    if (report.transfers() > 0) {
-      out.slack_min = any_slack ? std::min(out.slack_min, report.slack_min()) : report.slack_min();
-      any_slack = true;
-    }
   }
   return out;
 }

@@ -43,7 +43,6 @@ struct RunMeasure {
   int64_t largest_cluster = 0, largest_component = 0, longest_chain = 0;
   int64_t away_body_ticks = 0, body_ticks = 0;
   int64_t bytes_sent = 0, waits = 0, wait_us = 0;
-  double slack_min = 0;  // m; k >= 1 only
   double wall_seconds = 0;
 
   double LastMaxFrameMs() const { return windows.empty() ? 0 : windows.back().max_frame_ms; }

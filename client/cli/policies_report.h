@@ -58,7 +58,6 @@ struct PolicyFigures {
   double of_one = 0;               // mean_ms over that of the undivided run
   double waits = 0, wait_ms = 0;   // per tick and server
   double bytes = 0;                // payload per tick, link and direction
-  std::optional<double> slack;     // m, the least when two bodies first touched; k >= 1 only, when any was measured
 };
 PolicyFigures FiguresOf(const PolicyRun& run, const PolicyScene& scene);
 

@@ -41,8 +41,6 @@ struct RegionStats {
   int64_t home_crossings = 0;
   int64_t away_bodies = 0;  // owned now, centre outside the home rectangle
   int64_t violations = 0;   // broken horizons (I4), each also in Region::violations()
-  int64_t crossings = 0;    // R7
-  double slack_min = 0;     // k >= 1: smallest gap between own and foreign exact boxes when co-hosted
 };
 
 // A horizon that was broken: two bodies that were stepped apart although their exact boxes met.

@@ -192,7 +192,6 @@ void TickLoop::Report(const std::vector<RegionId>& waiting_for, bool finished) {
   r.set_longest_chain(stats.longest_chain);
   r.set_home_crossings(stats.home_crossings);
   r.set_violations(stats.violations);
-  r.set_slack_min(stats.slack_min);
   r.set_away_bodies(stats.away_bodies);
   r.set_away_body_ticks(away_body_ticks_);
   r.set_body_ticks(body_ticks_);

@@ -205,7 +205,6 @@ class Run {
       verdict_.largest_cluster = std::max(verdict_.largest_cluster, x.largest_cluster);
       verdict_.longest_chain = std::max(verdict_.longest_chain, x.longest_chain);
       verdict_.violations += x.violations;
-      verdict_.crossings += x.crossings;
       verdict_.home_crossings += x.home_crossings;
     }
   }

@@ -32,7 +32,7 @@ struct Verdict {
   int64_t largest_cluster = 0, longest_chain = 0;
   int64_t spawns = 0, live_inputs = 0;
   int64_t reconnects = 0, duplicates = 0, stalls = 0;
-  int64_t violations = 0, crossings = 0;
+  int64_t violations = 0;
   int64_t home_crossings = 0, away_body_ticks = 0, body_ticks = 0;
   uint64_t hash = 0;  // of the last state
 };

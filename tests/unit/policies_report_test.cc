@@ -69,14 +69,6 @@ TEST(PoliciesReport, FiguresAreThoseOfTheBusiestServerAndPerTick) {
   EXPECT_DOUBLE_EQ(f.bytes, 100);
 }
 
-TEST(PoliciesReport, SlackIsSaidOnlyWhereItWasMeasured) {
-  PolicyScene scene = Scene(0.2, {4, 5, 6, 7, 8});
-  scene.runs[0].measure.slack_min = scene.runs[1].measure.slack_min = 0.25;
-  EXPECT_FALSE(FiguresOf(scene.runs[0], scene).slack.has_value()) << "k = 0 predicts nothing";
-  EXPECT_EQ(FiguresOf(scene.runs[1], scene).slack, 0.25);
-  EXPECT_FALSE(FiguresOf(scene.runs[2], scene).slack.has_value());
-}
-
 TEST(PoliciesReport, BarsAreThoseOfZeroDelayAndOfReachOneAtOneDensity) {
   for (const double density : {0.05, 0.2, 0.5, 1.0}) {
     for (const ExchangeChoice& e : kExchangeChoices) {
