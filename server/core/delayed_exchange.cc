@@ -54,6 +54,8 @@ class DelayedExchange final : public Protocol {
     }
   }
 
+  bool MaySend(RegionId, int round) const override { return round == 0; }
+
   void Advance(std::vector<Frame>* out) override {
     if (!started_) {  // state 0: everybody must know of it before tick 1
       started_ = true;
@@ -676,7 +678,7 @@ class DelayedExchange final : public Protocol {
     for (RegionId peer : h_.peers) {
       Frame f;
       f.from = h_.self;
-      f.to = peer;
+      f.to = {peer};
       f.tick = h_.tick;
       Difference(told_[peer], next[peer], &f.auras, &f.gone);
       Difference(told_away_, away, &f.away, &f.away_gone);

@@ -50,6 +50,23 @@ struct Fragment {
   RegionId gives_back = kNoRegion;                        // R20: where it returns to, unless it has an edge
 };
 
+// A body that touches a region with which its owner exchanges no boxes yet.
+struct LateAura {
+  RegionId to = kNoRegion;
+  Aura aura;
+};
+
+// What a region says to all in each tick of the synchronous exchange (R16). Nothing to say: it is not passed on.
+struct Graph {
+  RegionId of = kNoRegion;
+  std::vector<Edge> edges;          // ascending
+  std::vector<Fragment> fragments;  // ascending by their first known body
+  std::vector<LateAura> late;       // ascending by `to`
+  // Regions with which `of` begins, or ceases to need, to exchange boxes from the next tick on; ascending.
+  std::vector<RegionId> opened, closed;
+  bool empty() const { return edges.empty() && fragments.empty() && late.empty() && opened.empty() && closed.empty(); }
+};
+
 enum class TransferCause : uint8_t {
   kAuraCollision = 1,     // the paper's AC (Algorithm 1): joins what it may touch
   kBoundaryTraverse = 2,  // the paper's BT (Algorithm 2): an island goes home
@@ -72,18 +89,25 @@ struct Away {
   friend bool operator==(const Away&, const Away&) = default;
 };
 
-// To every linked region at once.
-inline constexpr RegionId kEveryone = -2;
+// Rounds of the synchronous exchange within a tick. Graphs spread in two hops (server/core/allgather.h), and are made
+// again when bodies touch a region that was not told of them (R15).
+enum Round : int {
+  kBoxes = 0,
+  kGraphs = 1,
+  kGraphsOn = 2,  // passed on
+  kGraphsAgain = 3,
+  kGraphsAgainOn = 4,
+  kTransfers = 5,
+};
 
 struct Frame {
   RegionId from = kNoRegion;
-  RegionId to = kNoRegion;  // or kEveryone
+  std::vector<RegionId> to;  // ascending, never empty; where it was received: the receiver
   Tick tick = 0;
-  int round = 0;  // k = 0: 0 boxes, 1 graph, 2 transfers. k >= 1: 0
+  int round = 0;  // k = 0: of enum Round. k >= 1: 0
   std::vector<Aura> auras;
   std::vector<BodyId> gone;
-  std::vector<Edge> edges;
-  std::vector<Fragment> fragments;
+  std::vector<Graph> graphs;  // those that are not empty; ascending by `of`
   std::vector<Transfer> transfers;
   // k >= 1, as changes: boxes of the bodies that the sender projects and that are not wholly inside their owner's
   // region (PROTOCOL.md section 3c).

@@ -32,6 +32,36 @@ absl::Status Malformed(const char* field, const char* why) {
   return absl::InvalidArgumentError(absl::StrCat("frame.", field, ": ", why));
 }
 
+absl::Status ValidateGraph(const Graph& g) {
+  for (const Edge& e : g.edges) {
+    if (e.a == 0 || e.a >= e.b) return Malformed("graphs.edges", "a must be less than b");
+  }
+  for (const Fragment& f : g.fragments) {
+    if (f.known.empty() || !Ascending(f.known, [](BodyId id) { return id; })) {
+      return Malformed("graphs.fragments.known", "ids must ascend");
+    }
+    if (f.mass_by_home.empty()) return Malformed("graphs.fragments.mass_by_home", "must not be empty");
+    for (const auto& [home, kg] : f.mass_by_home) {
+      if (!std::isfinite(kg) || kg <= 0) return Malformed("graphs.fragments.mass_by_home", "must be > 0 kg");
+    }
+  }
+  for (const LateAura& l : g.late) {
+    if (l.aura.id == 0 || !Finite(l.aura.box)) return Malformed("graphs.late", "must have an id and a finite box");
+  }
+  return absl::OkStatus();
+}
+
+// Every round of the synchronous exchange says one kind of thing.
+absl::Status ValidateRound(const Frame& f) {
+  const bool boxes = f.round == kBoxes, transfers = f.round == kTransfers;
+  if (f.round < kBoxes || f.round > kTransfers) return Malformed("round", "no such round");
+  if (!boxes && !(f.auras.empty() && f.gone.empty())) return Malformed("auras", "not in this round");
+  if ((boxes || transfers) && !f.graphs.empty()) return Malformed("graphs", "not in this round");
+  if (transfers == f.transfers.empty()) return Malformed("transfers", "in the last round, and only there");
+  if (!f.away.empty() || !f.away_gone.empty()) return Malformed("away", "not in a synchronous exchange");
+  return absl::OkStatus();
+}
+
 absl::Status Validate(const Frame& f) {
   auto identity = [](BodyId id) { return id; };
   if (!Ascending(f.auras, [](const Aura& a) { return a.id; })) return Malformed("auras", "ids must ascend");
@@ -44,15 +74,9 @@ absl::Status Validate(const Frame& f) {
     if (!Finite(a.box)) return Malformed("away.box", "must be finite and not inverted");
   }
   if (!Ascending(f.away_gone, identity)) return Malformed("away_gone", "ids must ascend");
-  for (const Edge& e : f.edges) {
-    if (e.a == 0 || e.a >= e.b) return Malformed("edges", "a must be less than b");
-  }
-  for (const Fragment& g : f.fragments) {
-    if (g.known.empty() || !Ascending(g.known, identity)) return Malformed("fragments.known", "ids must ascend");
-    if (g.mass_by_home.empty()) return Malformed("fragments.mass_by_home", "must not be empty");
-    for (const auto& [home, kg] : g.mass_by_home) {
-      if (!std::isfinite(kg) || kg <= 0) return Malformed("fragments.mass_by_home", "must be > 0 kg");
-    }
+  if (!Ascending(f.graphs, [](const Graph& g) { return g.of + 1; })) return Malformed("graphs", "regions must ascend");
+  for (const Graph& g : f.graphs) {
+    if (absl::Status s = ValidateGraph(g); !s.ok()) return s;
   }
   for (const Transfer& t : f.transfers) {
     if (t.ids.empty() || !Ascending(t.ids, identity)) return Malformed("transfers.ids", "must ascend");
@@ -63,22 +87,22 @@ absl::Status Validate(const Frame& f) {
 
 }  // namespace
 
-absl::Status Inbox::Accept(Frame frame, bool synchronous) {
+absl::Status Inbox::Accept(Frame frame, Tick now, bool synchronous) {
   if (absl::Status s = Validate(frame); !s.ok()) return s;
+  // A peer that exchanges synchronously cannot end a tick without us.
+  if (frame.tick > now + (synchronous ? 2 : kMaxLead)) {
+    return absl::InvalidArgumentError(absl::StrCat("frame.tick: ", frame.tick, " is too far ahead of ", now));
+  }
   bool follows = false;
-  if (!synchronous) {
-    follows = frame.round == 0 && frame.tick == tick_ + 1;
-  } else if (frame.round == 0) {
-    follows = frame.tick == std::max<Tick>(tick_, 0) + 1 && round_ >= 1;
+  if (synchronous) {
+    if (absl::Status s = ValidateRound(frame); !s.ok()) return s;
+    follows = frame.tick > 0 && (frame.tick != tick_ ? frame.tick > tick_ : frame.round > round_);
   } else {
-    follows = frame.tick == tick_ && frame.round == round_ + 1 && frame.round <= 2;
+    follows = frame.round == 0 && frame.tick == tick_ + 1;
   }
   if (!follows) {
     return absl::InvalidArgumentError(absl::StrCat("frame.tick: (", frame.tick, ", round ", frame.round,
                                                    ") cannot follow (", tick_, ", round ", round_, ")"));
-  }
-  if (!frames_.empty() && frame.tick > frames_.front().tick + kMaxLead) {
-    return absl::InvalidArgumentError(absl::StrCat("frame.tick: ", frame.tick, " is too far ahead"));
   }
   tick_ = frame.tick;
   round_ = frame.round;

@@ -27,15 +27,16 @@ struct Held {
 // Frames of one peer that wait for their phase.
 class Inbox {
  public:
-  // InvalidArgument unless the frame can follow the last one: ticks and rounds only grow, without holes.
-  absl::Status Accept(Frame frame, bool synchronous);
+  // InvalidArgument unless the frame can follow the last one: ticks and rounds only grow; with a delay, without holes.
+  // `now` is the last tick that was stepped here.
+  absl::Status Accept(Frame frame, Tick now, bool synchronous);
   const Frame* Front() const { return frames_.empty() ? nullptr : &frames_.front(); }
   Frame Pop();
 
  private:
   std::deque<Frame> frames_;
   Tick tick_ = -1;
-  int round_ = 2;
+  int round_ = kTransfers;
 };
 
 struct Holdings {
@@ -88,6 +89,8 @@ class Protocol {
   virtual bool Ready() const = 0;
   virtual void Missing(std::vector<RegionId>* out) const = 0;
   virtual void Advance(std::vector<Frame>* out) = 0;
+  // Whether a frame of this round can come from that peer.
+  virtual bool MaySend(RegionId peer, int round) const = 0;
   // Appends what is in flight from here: stepped by nobody's engine in tick `tick() + 1` (before its step), or in state
   // `tick()`.
   virtual void ObserveInFlight(std::vector<BodyRecord>* out) const = 0;

@@ -20,6 +20,28 @@ double InitialMargin(const World& world) {
   return (MarginsFor(world).predict + 4 * k + 2) * step;
 }
 
+absl::Status CheckRegions(const Graph& g, int regions) {
+  const auto known = [regions](RegionId r) { return r >= 0 && r < regions; };
+  const auto all_others = [&](const std::vector<RegionId>& list) {
+    return std::all_of(list.begin(), list.end(), [&](RegionId r) { return known(r) && r != g.of; });
+  };
+  if (!known(g.of)) return absl::InvalidArgumentError("frame.graphs.of: no such region");
+  for (const Fragment& f : g.fragments) {
+    if (f.gives_back != kNoRegion && !known(f.gives_back)) {
+      return absl::InvalidArgumentError("frame.graphs.fragments.gives_back: no such region");
+    }
+    for (const auto& [home, kg] : f.mass_by_home) {
+      if (!known(home)) return absl::InvalidArgumentError("frame.graphs.fragments.mass_by_home: no such region");
+    }
+  }
+  for (const LateAura& l : g.late) {
+    if (!known(l.to) || l.to == g.of) return absl::InvalidArgumentError("frame.graphs.late.to: no such region");
+  }
+  if (!all_others(g.opened)) return absl::InvalidArgumentError("frame.graphs.opened: no such other region");
+  if (!all_others(g.closed)) return absl::InvalidArgumentError("frame.graphs.closed: no such other region");
+  return absl::OkStatus();
+}
+
 }  // namespace
 
 struct Region::Impl {
@@ -48,21 +70,17 @@ absl::Status Region::Receive(Frame frame) {
   if (it == h.inboxes.end()) {
     return absl::InvalidArgumentError(absl::StrCat("frame.from: ", frame.from, " is no peer of region ", h.self));
   }
-  if (frame.to != h.self && frame.to != kEveryone) {
-    return absl::InvalidArgumentError(absl::StrCat("frame.to: ", frame.to, " is not region ", h.self));
+  if (!std::binary_search(frame.to.begin(), frame.to.end(), h.self)) {
+    return absl::InvalidArgumentError(absl::StrCat("frame.to: does not name region ", h.self));
   }
-  const int regions = h.world.layout.size();
-  for (const Fragment& f : frame.fragments) {
-    if (f.gives_back != kNoRegion && (f.gives_back < 0 || f.gives_back >= regions)) {
-      return absl::InvalidArgumentError("frame.fragments.gives_back: no such region");
-    }
-    for (const auto& [home, kg] : f.mass_by_home) {
-      if (home < 0 || home >= regions) {
-        return absl::InvalidArgumentError("frame.fragments.mass_by_home: no such region");
-      }
-    }
+  for (const Graph& g : frame.graphs) {
+    if (absl::Status s = CheckRegions(g, h.world.layout.size()); !s.ok()) return s;
   }
-  return it->second.Accept(std::move(frame), h.world.exchange.k == 0);
+  if (!impl_->protocol->MaySend(frame.from, frame.round)) {
+    return absl::InvalidArgumentError(
+        absl::StrCat("frame.round: ", frame.round, " is not for region ", frame.from, " to send to region ", h.self));
+  }
+  return it->second.Accept(std::move(frame), h.tick, h.world.exchange.k == 0);
 }
 
 bool Region::Ready() const { return impl_->protocol->Ready(); }

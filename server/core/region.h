@@ -2,8 +2,10 @@
 // socket, file or log; the whole distributed run is a pure function of the world and of the accepted inputs.
 //
 // A tick runs in phases. Each phase needs certain frames of the peers; Advance runs it and yields frames to send:
-//   k = 0   kBegin: inputs, boxes -> round 0.  kGraph: needs round 0 of all -> round 1.  kDecide: needs round 1 of all
-//           -> round 2 to those that get a transfer.  kArrive: needs round 2 of those that send one.  kStep.
+//   k = 0   kBegin: inputs; boxes to those that are open to this region.  kGraph: needs their boxes; own graph to the
+//           row.  kRelay: needs the row's graphs; passes them on.  kDecide: needs the other rows' graphs; transfers, or
+//           once more from kRelay on when a box was told late.  kArrive: needs the transfers of those that send one.
+//           kStep.
 //   k >= 1  kBegin: needs the frames of tick n-k of all; applies them and the inputs.  kStep: steps, detects, decides,
 //           -> the frames of tick n.
 // (PROTOCOL.md sections 4 and 10; the tick order is P22.)
@@ -23,7 +25,7 @@
 
 namespace aureole {
 
-enum class Phase : uint8_t { kBegin, kGraph, kDecide, kArrive, kStep };
+enum class Phase : uint8_t { kBegin, kGraph, kRelay, kDecide, kArrive, kStep };
 
 // Counters since the start. "Touching": the cluster had more than one body.
 struct RegionStats {
@@ -38,6 +40,7 @@ struct RegionStats {
   int64_t auras_told = 0;             // auras that peers hold of us now
   int64_t aura_tests = 0;             // bodies tested against other regions or foreign boxes
   int64_t exchanges_ended_early = 0;  // k = 0: ticks without a third exchange
+  int64_t graphs_again = 0;           // k = 0: ticks in which somebody told a box late
   int64_t home_crossings = 0;
   int64_t away_bodies = 0;  // owned now, centre outside the home rectangle
   int64_t violations = 0;   // broken horizons (I4), each also in Region::violations()
@@ -75,7 +78,7 @@ class Region {
   // The last tick that was stepped.
   Tick tick() const;
   Phase phase() const;
-  // Every region this one exchanges frames with, ascending. (All others: the graph of k = 0 is broadcast, R16.)
+  // Every region this one may exchange frames with, ascending: all others.
   const std::vector<RegionId>& peers() const;
 
   // Takes the next frame of a peer. Frames of one peer come in the order it sent them, each once. InvalidArgument when

@@ -1,6 +1,10 @@
 // The synchronous exchange, k = 0 (PROTOCOL.md section 10, form A): inside one tick, on states that stand still, boxes
 // -> graph -> transfers. Nothing is predicted, so there is no speed tolerance, and three exchanges are enough for any
 // layout.
+//
+// Boxes go only between regions that have opened to each other, a little before a body of one reaches the other. A body
+// that comes faster, or from nowhere, is told late: with its owner's graph, which goes to all; then all make their
+// graphs again. So the messages of a region grow with its neighbours and with the square root of all regions.
 #include <algorithm>
 #include <iterator>
 #include <map>
@@ -9,6 +13,7 @@
 #include <absl/container/flat_hash_map.h>
 #include <absl/container/flat_hash_set.h>
 
+#include "server/core/allgather.h"
 #include "server/core/check.h"
 #include "server/core/holdings.h"
 #include "server/core/union_find.h"
@@ -19,10 +24,15 @@ namespace {
 // Boxes are tested against regions with this to spare, so that the two comparisons of R15 cannot disagree by rounding;
 // metres.
 constexpr double kSpare = 1e-3;
+// Regions open to each other when a body comes this near, and close when none was for so long: metres, ticks. That
+// decides how often boxes are told late, and nothing else. Half a metre is a tick at 32 m/s.
+constexpr double kOpenAhead = 0.5;
+constexpr Tick kStayOpen = 64;
 
 class SyncExchange final : public Protocol {
  public:
-  explicit SyncExchange(Holdings& holdings) : h_(holdings) {}
+  explicit SyncExchange(Holdings& holdings)
+      : h_(holdings), gather_(h_.world.layout.size(), h_.self), open_(h_.peers.size()) {}
 
   Phase phase() const override { return phase_; }
 
@@ -44,7 +54,10 @@ class SyncExchange final : public Protocol {
       case Phase::kBegin:
         return Begin(out);
       case Phase::kGraph:
-        return SendGraph(out);
+        TakeBoxes();
+        return SendGraph(kGraphs, out);
+      case Phase::kRelay:
+        return PassOn(out);
       case Phase::kDecide:
         return Decide(out);
       case Phase::kArrive:
@@ -56,6 +69,12 @@ class SyncExchange final : public Protocol {
     }
   }
 
+  bool MaySend(RegionId peer, int round) const override {
+    if (round == kGraphs || round == kGraphsAgain) return Contains(gather_.row, peer);
+    if (round == kGraphsOn || round == kGraphsAgainOn) return Contains(gather_.sources, peer);
+    return round == kBoxes || round == kTransfers;
+  }
+
   void ObserveInFlight(std::vector<BodyRecord>*) const override {}
   Tick EffectTick(const Input&) const override { return phase_ == Phase::kBegin ? now() : now() + 1; }
 
@@ -64,6 +83,12 @@ class SyncExchange final : public Protocol {
     BodyId id;
     RegionId owner;
     Box box;
+  };
+  // Whether boxes are exchanged with a peer: while either side wants it.
+  struct Opening {
+    bool by_us = false, by_them = false;
+    Tick last_near = -kStayOpen;  // when a body of ours was near the peer
+    bool Now() const { return by_us || by_them; }
   };
   // A contact component of own bodies; `wire` is what the others get to know of it.
   struct Component {
@@ -77,11 +102,13 @@ class SyncExchange final : public Protocol {
   int NeededRound(RegionId peer) const {
     switch (phase_) {
       case Phase::kGraph:
-        return 0;
+        return open_[PeerIndex(peer)].Now() ? kBoxes : -1;
+      case Phase::kRelay:
+        return Contains(gather_.row, peer) ? round_ : -1;
       case Phase::kDecide:
-        return 1;
+        return Contains(gather_.sources, peer) ? round_ + 1 : -1;
       case Phase::kArrive:
-        return senders_.contains(peer) ? 2 : -1;
+        return senders_.contains(peer) ? kTransfers : -1;
       default:
         return -1;
     }
@@ -96,10 +123,15 @@ class SyncExchange final : public Protocol {
     return true;
   }
 
-  Frame MakeFrame(RegionId to, int round) const {
+  static bool Contains(const std::vector<RegionId>& list, RegionId r) {
+    return std::binary_search(list.begin(), list.end(), r);
+  }
+  size_t PeerIndex(RegionId peer) const { return static_cast<size_t>(peer > h_.self ? peer - 1 : peer); }
+
+  Frame MakeFrame(std::vector<RegionId> to, int round) const {
     Frame f;
     f.from = h_.self;
-    f.to = to;
+    f.to = std::move(to);
     f.tick = now();
     f.round = round;
     return f;
@@ -117,7 +149,7 @@ class SyncExchange final : public Protocol {
       if (!elsewhere) h_.ApplyInput(i);
     }
     near_.clear();
-    h_.engine->CollectOutside(h_.rect, kSpare, &near_);
+    h_.engine->CollectOutside(h_.rect, kOpenAhead, &near_);
     h_.CountHomes(near_);
     BoundaryNetworkUpdate(out);
     phase_ = h_.peers.empty() ? Phase::kStep : Phase::kGraph;
@@ -133,22 +165,38 @@ class SyncExchange final : public Protocol {
       const Box box = h_.engine->View(id).box;
       const WireBox wire = RoundOutward(box);
       bool told = false;
-      for (RegionId peer : h_.peers) {
-        if (h_.world.layout.rect(peer).Gap(box) > kSpare) continue;
-        next_[peer].push_back({id, wire});
+      for (size_t p = 0; p < h_.peers.size(); ++p) {
+        const double gap = h_.world.layout.rect(h_.peers[p]).Gap(box);
+        if (gap > kOpenAhead) continue;
+        open_[p].last_near = now();
+        if (gap > kSpare) continue;
+        next_[h_.peers[p]].push_back({id, wire});
         told = true;
       }
       if (told) told_ids_.push_back(id);
     }
     h_.stats.aura_tests += static_cast<int64_t>(near_.size());
     h_.stats.auras_told = 0;
-    for (RegionId peer : h_.peers) {
-      Frame f = MakeFrame(peer, 0);
-      Compare(told_[peer], next_[peer], &f);
-      h_.stats.auras_sent += static_cast<int64_t>(f.auras.size());
-      h_.stats.auras_told += static_cast<int64_t>(next_[peer].size());
-      std::swap(told_[peer], next_[peer]);
+    mine_ = {};
+    mine_.of = h_.self;
+    for (size_t p = 0; p < h_.peers.size(); ++p) TellBoxes(h_.peers[p], open_[p], out);
+  }
+
+  void TellBoxes(RegionId peer, const Opening& opening, std::vector<Frame>* out) {
+    Told& told = told_[peer];
+    Told& next = next_[peer];
+    Frame f = MakeFrame({peer}, kBoxes);
+    Compare(told, next, &f);
+    h_.stats.auras_sent += static_cast<int64_t>(f.auras.size());
+    h_.stats.auras_told += static_cast<int64_t>(next.size());
+    std::swap(told, next);
+    const bool near = now() - opening.last_near < kStayOpen;
+    if (near && !opening.by_us) mine_.opened.push_back(peer);
+    if (!near && opening.by_us) mine_.closed.push_back(peer);
+    if (opening.Now()) {
       out->push_back(std::move(f));
+    } else {  // nothing was told before, so nothing is gone
+      for (const Aura& a : f.auras) mine_.late.push_back({peer, a});
     }
   }
 
@@ -178,27 +226,57 @@ class SyncExchange final : public Protocol {
 
   // R15, R16: which bodies of different owners meet, as far as this region was told; and its own components that others
   // may have to move.
-  void SendGraph(std::vector<Frame>* out) {
-    TakeBoxes();
-    Frame f = MakeFrame(kEveryone, 1);
+  void SendGraph(int round, std::vector<Frame>* out) {
+    SortForeign();
+    mine_.edges.clear();
+    mine_.fragments.clear();
     std::vector<BodyId> known = told_ids_;
-    FindEdges(&f.edges, &known);
+    FindEdges(&mine_.edges, &known);
     std::sort(known.begin(), known.end());
     known.erase(std::unique(known.begin(), known.end()), known.end());
     FindComponents(known);
-    for (const Component& c : components_) f.fragments.push_back(c.wire);
-    graph_[h_.self] = f;
-    out->push_back(std::move(f));
+    for (const Component& c : components_) mine_.fragments.push_back(c.wire);
+    graphs_.clear();
+    if (!mine_.empty()) graphs_.push_back(mine_);
+    round_ = round;
+    if (!gather_.row.empty()) {
+      Frame f = MakeFrame(gather_.row, round);
+      f.graphs = graphs_;
+      out->push_back(std::move(f));
+    }
+    phase_ = Phase::kRelay;
+  }
+
+  // The second hop: what the own row has to say, to one region of each other row.
+  void PassOn(std::vector<Frame>* out) {
+    for (RegionId peer : gather_.row) TakeGraphs(peer);
+    if (!gather_.targets.empty()) {
+      Frame f = MakeFrame(gather_.targets, round_ + 1);
+      f.graphs = graphs_;
+      std::sort(f.graphs.begin(), f.graphs.end(), [](const Graph& x, const Graph& y) { return x.of < y.of; });
+      out->push_back(std::move(f));
+    }
     phase_ = Phase::kDecide;
   }
 
+  void TakeGraphs(RegionId peer) {
+    Frame f = h_.inboxes.at(peer).Pop();
+    graphs_.insert(graphs_.end(), std::make_move_iterator(f.graphs.begin()), std::make_move_iterator(f.graphs.end()));
+  }
+
   void TakeBoxes() {
-    foreign_.clear();
     for (RegionId peer : h_.peers) {
+      if (!open_[PeerIndex(peer)].Now()) continue;
       Frame f = h_.inboxes.at(peer).Pop();
       auto& boxes = remote_[peer];
       for (BodyId id : f.gone) boxes.erase(id);
       for (const Aura& a : f.auras) boxes[a.id] = Widen(a.box);
+    }
+  }
+
+  void SortForeign() {
+    foreign_.clear();
+    for (const auto& [peer, boxes] : remote_) {
       for (const auto& [id, box] : boxes) foreign_.push_back({id, peer, box});
     }
     std::sort(foreign_.begin(), foreign_.end(), [](const Foreign& x, const Foreign& y) {
@@ -281,9 +359,15 @@ class SyncExchange final : public Protocol {
     return home == h_.self ? kNoRegion : home;
   }
 
-  // R17, R19: all regions hold the same graph, so all find the same components and the same owner for each.
+  // R17, R19: all regions hold the same graphs, so all find the same components and the same owner for each.
   void Decide(std::vector<Frame>* out) {
-    for (RegionId peer : h_.peers) graph_[peer] = h_.inboxes.at(peer).Pop();
+    for (RegionId peer : gather_.sources) TakeGraphs(peer);
+    std::sort(graphs_.begin(), graphs_.end(), [](const Graph& x, const Graph& y) { return x.of < y.of; });
+    if (round_ == kGraphs && TakeLate()) {
+      ++h_.stats.graphs_again;
+      return SendGraph(kGraphsAgain, out);
+    }
+    OpenAndClose();
     std::map<RegionId, Frame> leaving;
     senders_.clear();
     GiveBackIslands(&leaving);
@@ -293,15 +377,41 @@ class SyncExchange final : public Protocol {
     phase_ = senders_.empty() ? Phase::kStep : Phase::kArrive;
   }
 
+  // Whether anybody told anybody late; what is for this region is taken.
+  bool TakeLate() {
+    bool any = false;
+    for (const Graph& g : graphs_) {
+      any |= !g.late.empty();
+      for (const LateAura& l : g.late) {
+        if (l.to == h_.self) remote_[g.of][l.aura.id] = Widen(l.aura.box);
+      }
+    }
+    mine_.late.clear();
+    return any;
+  }
+
+  // Both ends read the same graphs, so both change at the same tick.
+  void OpenAndClose() {
+    for (const Graph& g : graphs_) {
+      for (const std::vector<RegionId>* list : {&g.opened, &g.closed}) {
+        for (RegionId r : *list) {
+          if (g.of == h_.self) open_[PeerIndex(r)].by_us = list == &g.opened;
+          if (r == h_.self) open_[PeerIndex(g.of)].by_them = list == &g.opened;
+        }
+      }
+    }
+  }
+
   struct Node {
     RegionId owner;
-    int index;  // of the fragment in its owner's graph
+    const Fragment* fragment;
+    size_t index;  // in its owner's graph
   };
 
   // The bodies that have an edge, over all graphs.
   absl::flat_hash_map<BodyId, int> EdgeBodies() const {
     absl::flat_hash_map<BodyId, int> bodies;
-    for (const auto& [owner, graph] : graph_) {
+    for (const Graph& graph : graphs_) {
       for (const Edge& e : graph.edges) {
         bodies.emplace(e.a, -1);
         bodies.emplace(e.b, -1);
@@ -316,7 +426,7 @@ class SyncExchange final : public Protocol {
     absl::flat_hash_map<BodyId, int> node_of = EdgeBodies();
     if (node_of.empty()) return;
     std::vector<Node> nodes;
-    for (const auto& [owner, graph] : graph_) {
+    for (const Graph& graph : graphs_) {
       for (size_t i = 0; i < graph.fragments.size(); ++i) {
         bool linked = false;
         for (BodyId id : graph.fragments[i].known) {
@@ -325,15 +435,15 @@ class SyncExchange final : public Protocol {
           it->second = static_cast<int>(nodes.size());
           linked = true;
         }
-        if (linked) nodes.push_back({owner, static_cast<int>(i)});
+        if (linked) nodes.push_back({graph.of, &graph.fragments[i], i});
       }
     }
     UnionFind sets(static_cast<int>(nodes.size()));
-    for (const auto& [owner, graph] : graph_) {
+    for (const Graph& graph : graphs_) {
       for (const Edge& e : graph.edges) {
         const int a = node_of.at(e.a), b = node_of.at(e.b);
         AUREOLE_CHECK(a >= 0 && b >= 0, "no fragment holds body %llu of the edge that region %d saw",
-                      static_cast<unsigned long long>(a < 0 ? e.a : e.b), owner);
+                      static_cast<unsigned long long>(a < 0 ? e.a : e.b), graph.of);
         sets.Unite(a, b);
       }
     }
@@ -348,7 +458,7 @@ class SyncExchange final : public Protocol {
     std::set<RegionId> owners;
     int64_t bodies = 0;
     for (int i : members) {
-      const Fragment& f = graph_.at(nodes[i].owner).fragments[nodes[i].index];
+      const Fragment& f = *nodes[i].fragment;
       owners.insert(nodes[i].owner);
       bodies += f.bodies;
       for (const auto& [home, kg] : f.mass_by_home) AddMass(&mass, home, kg);
@@ -370,13 +480,13 @@ class SyncExchange final : public Protocol {
   // Returns that were announced with the graph hold unless the component has an edge.
   void GiveBackIslands(std::map<RegionId, Frame>* leaving) {
     const absl::flat_hash_map<BodyId, int> linked = EdgeBodies();
-    for (const auto& [owner, graph] : graph_) {
+    for (const Graph& graph : graphs_) {
       for (size_t i = 0; i < graph.fragments.size(); ++i) {
         const Fragment& f = graph.fragments[i];
         if (f.gives_back == kNoRegion) continue;
         if (std::any_of(f.known.begin(), f.known.end(), [&linked](BodyId id) { return linked.contains(id); })) continue;
-        if (f.gives_back == h_.self) senders_.insert(owner);
-        if (owner == h_.self) {
+        if (f.gives_back == h_.self) senders_.insert(graph.of);
+        if (graph.of == h_.self) {
           Send(components_[i].members, f.gives_back, TransferCause::kBoundaryTraverse, leaving);
         }
       }
@@ -388,7 +498,7 @@ class SyncExchange final : public Protocol {
     Transfer t = h_.Depart(std::move(ids), to, cause);
     t.state = h_.engine->Extract(t.ids);
     auto it = leaving->find(to);
-    if (it == leaving->end()) it = leaving->emplace(to, MakeFrame(to, 2)).first;
+    if (it == leaving->end()) it = leaving->emplace(to, MakeFrame({to}, kTransfers)).first;
     it->second.transfers.push_back(std::move(t));
   }
 
@@ -402,6 +512,8 @@ class SyncExchange final : public Protocol {
   }
 
   Holdings& h_;
+  const Allgather gather_;
+  std::vector<Opening> open_;  // parallel to the peers
   Phase phase_ = Phase::kBegin;
   std::vector<Input> inputs_;
   std::vector<BodyId> near_;                         // own bodies whose box may touch another region
@@ -409,8 +521,10 @@ class SyncExchange final : public Protocol {
   absl::flat_hash_map<RegionId, Told> told_, next_;  // what each peer holds of us; what it must hold
   absl::flat_hash_map<RegionId, absl::flat_hash_map<BodyId, Box>> remote_;  // what each peer has told
   std::vector<Foreign> foreign_;                                            // all of that, by min.x
-  std::vector<Component> components_;                                       // parallel to graph_[self].fragments
-  std::map<RegionId, Frame> graph_;                                         // round 1 of this tick, own included
+  std::vector<Component> components_;                                       // parallel to mine_.fragments
+  Graph mine_;                                                              // of this tick
+  int round_ = kGraphs;                                                     // in which the graphs go around
+  std::vector<Graph> graphs_;                                               // of this tick, own included
   std::set<RegionId> senders_;                                              // who sends a transfer in this tick
 };
 

@@ -7,6 +7,7 @@
 #include <iostream>
 #include <string>
 
+#include <absl/synchronization/mutex.h>
 #include <spdlog/sinks/stdout_sinks.h>
 #include <spdlog/spdlog.h>
 #include <CLI/CLI.hpp>
@@ -42,6 +43,8 @@ int main(int argc, char** argv) {
     return s.ok() ? 0 : 1;
   }
 
+  // Debian builds Abseil with its search for deadlocks on, which gRPC then pays for at every lock.
+  absl::SetMutexDeadlockDetectionMode(absl::OnDeadlockCycle::kIgnore);
   aureole::BlockSignals();
   if (exit_with_parent) {
     const pid_t parent = getppid();

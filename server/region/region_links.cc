@@ -10,11 +10,13 @@ RegionLinks::RegionLinks(const LinkIdentity& identity, const std::vector<RegionI
                          std::function<void(RegionId, const std::string&)> log)
     : identity_(identity) {
   const auto deliver = [this](Frame frame) {
+    bool enough = false;
     {
       const std::lock_guard lock(mutex_);
       mailbox_.push_back(std::move(frame));
+      enough = mailbox_.size() >= awaited_;
     }
-    arrived_.notify_one();
+    if (enough) arrived_.notify_one();
   };
   for (RegionId peer : peers)
     links_.push_back(std::make_unique<PeerLink>(PeerLink::Options{identity, peer, deliver, log}));
@@ -38,15 +40,16 @@ void RegionLinks::Send(const std::vector<Frame>& frames) {
   for (const Frame& frame : frames) {
     const auto bytes = std::make_shared<const std::string>(EncodeFrame(frame));
     for (const auto& link : links_) {
-      if (frame.to == kEveryone || frame.to == link->peer()) link->Send(bytes);
+      if (std::binary_search(frame.to.begin(), frame.to.end(), link->peer())) link->Send(bytes);
     }
   }
 }
 
-void RegionLinks::Receive(Clock::time_point deadline, std::vector<Frame>* out) {
+void RegionLinks::Receive(size_t at_least, Clock::time_point deadline, std::vector<Frame>* out) {
   out->clear();
   std::unique_lock lock(mutex_);
-  if (mailbox_.empty()) arrived_.wait_until(lock, deadline, [this] { return interrupted_ || !mailbox_.empty(); });
+  awaited_ = at_least;
+  arrived_.wait_until(lock, deadline, [this] { return interrupted_ || mailbox_.size() >= awaited_; });
   out->swap(mailbox_);
 }
 

@@ -33,9 +33,9 @@ class RegionLinks {
 
   // Queues the frames; never waits for the network.
   void Send(const std::vector<Frame>& frames);
-  // Moves what has arrived to `out`; when that is nothing, waits until there is something, `deadline`, or Interrupt.
-  // Frames of one peer come in its order.
-  void Receive(Clock::time_point deadline, std::vector<Frame>* out);
+  // Moves what has arrived to `out`; when that is less than `at_least` frames, waits until it is as much, `deadline`,
+  // or Interrupt. Frames of one peer come in its order.
+  void Receive(size_t at_least, Clock::time_point deadline, std::vector<Frame>* out);
   // Ends a waiting Receive, and every later one at once.
   void Interrupt();
 
@@ -57,6 +57,7 @@ class RegionLinks {
   std::mutex mutex_;
   std::condition_variable arrived_;
   std::vector<Frame> mailbox_;
+  size_t awaited_ = 1;  // frames that Receive waits for: each wake-up of the tick thread costs
   bool interrupted_ = false;
 };
 

@@ -92,12 +92,12 @@ bool TickLoop::AwaitPeers() {
     Take(Clock::now() + kWaitIsWorthTelling);
     const Clock::time_point now = Clock::now();
     if (region_->Ready() || now - since < kWaitIsWorthTelling) continue;
-    std::vector<RegionId> missing;
-    region_->Missing(&missing);
-    if (now - reported_at_ >= kReportEvery) Report(missing, false);
+    missing_.clear();
+    region_->Missing(&missing_);
+    if (now - reported_at_ >= kReportEvery) Report(missing_, false);
     if (!logged && now - since >= kWaitIsWorthLogging) {
       logged = true;
-      hooks_.log(absl::StrCat("tick ", region_->tick() + 1, " waits for region ", absl::StrJoin(missing, ", ")));
+      hooks_.log(absl::StrCat("tick ", region_->tick() + 1, " waits for region ", absl::StrJoin(missing_, ", ")));
     }
   }
   const Clock::duration wait = Clock::now() - since;
@@ -111,7 +111,9 @@ bool TickLoop::AwaitPeers() {
 }
 
 void TickLoop::Take(Clock::time_point deadline) {
-  links_->Receive(deadline, &in_);
+  missing_.clear();
+  region_->Missing(&missing_);
+  links_->Receive(missing_.size(), deadline, &in_);
   for (Frame& frame : in_) {
     const RegionId from = frame.from;
     const Tick tick = frame.tick;

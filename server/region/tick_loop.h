@@ -62,6 +62,7 @@ class TickLoop {
   FrameClock clock_;
   WindowMeter windows_;
   std::vector<Frame> in_, out_;
+  std::vector<RegionId> missing_;
   v1::Report pending_;  // hashes, windows and violations since the last report
   std::vector<double> frames_since_report_;
   Clock::time_point start_;  // of tick 0

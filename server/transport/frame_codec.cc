@@ -1,5 +1,6 @@
 #include "server/transport/frame_codec.h"
 
+#include <algorithm>
 #include <cmath>
 
 #include <absl/strings/str_cat.h>
@@ -64,6 +65,28 @@ void EncodeFragment(const Fragment& f, v1::Frame::Fragment* out) {
     out->add_mass(mass);
   }
   out->set_gives_back(static_cast<uint32_t>(f.gives_back + 1));
+}
+
+void EncodeGraph(const Graph& g, v1::Frame::Graph* out) {
+  out->set_of(static_cast<uint32_t>(g.of));
+  IdWriter edges(out->mutable_edge_a());
+  for (const Edge& e : g.edges) {
+    edges.Add(e.a);
+    out->add_edge_step(e.b - e.a);
+  }
+  for (const Fragment& f : g.fragments) EncodeFragment(f, out->add_fragment());
+  IdWriter late(out->mutable_late_id());
+  for (const LateAura& l : g.late) {
+    out->add_late_to(static_cast<uint32_t>(l.to));
+    late.Add(l.aura.id);
+    AddBox(l.aura.box, out->mutable_late_box());
+  }
+  for (RegionId r : g.opened) out->add_opened(static_cast<uint32_t>(r));
+  for (RegionId r : g.closed) out->add_closed(static_cast<uint32_t>(r));
+}
+
+bool WithinLimits(const Graph& g) {
+  return g.edges.size() <= kMaxEdges && g.fragments.size() <= kMaxFragments && g.late.size() <= kMaxAuras;
 }
 
 void EncodeTransfer(const Transfer& t, v1::Frame::Transfer* out) {
@@ -145,6 +168,12 @@ absl::Status DecodeRegion(const char* field, uint32_t plus_one, RegionId* out) {
   return absl::OkStatus();
 }
 
+absl::Status DecodeKnownRegion(const char* field, uint32_t region, RegionId* out) {
+  if (region >= kMaxRegions) return Bad(field, absl::StrCat("no region ", region));
+  *out = static_cast<RegionId>(region);
+  return absl::OkStatus();
+}
+
 absl::Status DecodeAuras(const v1::Frame& in, std::vector<Aura>* out) {
   std::vector<BodyId> ids;
   AUREOLE_RETURN_IF_ERROR(DecodeIds("aura_id", in.aura_id(), kMaxAuras, false, &ids));
@@ -171,36 +200,74 @@ absl::Status DecodeAuras(const v1::Frame& in, std::vector<Aura>* out) {
   return absl::OkStatus();
 }
 
-absl::Status DecodeEdges(const v1::Frame& in, std::vector<Edge>* out) {
+absl::Status DecodeFragment(const v1::Frame::Fragment& in, Fragment* out) {
+  AUREOLE_RETURN_IF_ERROR(DecodeIds("graph.fragment.known", in.known(), kMaxAuras, true, &out->known));
+  if (out->known.empty()) return Bad("graph.fragment.known", "is empty");
+  out->id = in.id();
+  out->bodies = in.bodies();
+  if (out->id == 0 || out->id > out->known[0])
+    return Bad("graph.fragment.id", absl::StrCat(out->id, " is no smallest id"));
+  if (out->bodies < out->known.size())
+    return Bad("graph.fragment.bodies", absl::StrCat(out->bodies, ", more are named"));
+  AUREOLE_RETURN_IF_ERROR(CheckCount("graph.fragment.home", in.home_size(), kMaxRegions));
+  AUREOLE_RETURN_IF_ERROR(CheckColumn("graph.fragment.mass", in.mass_size(), 1, in.home_size(), false));
+  for (int i = 0; i < in.home_size(); ++i) {
+    if (in.home(i) >= kMaxRegions || (i > 0 && in.home(i) <= in.home(i - 1))) {
+      return Bad("graph.fragment.home", absl::StrCat(in.home(i), " is out of range or order"));
+    }
+    if (!std::isfinite(in.mass(i)) || in.mass(i) < 0)
+      return Bad("graph.fragment.mass", absl::StrCat(in.mass(i), " kg"));
+    out->mass_by_home.emplace_back(static_cast<RegionId>(in.home(i)), in.mass(i));
+  }
+  return DecodeRegion("graph.fragment.gives_back", in.gives_back(), &out->gives_back);
+}
+
+absl::Status DecodeEdges(const v1::Frame::Graph& in, std::vector<Edge>* out) {
   std::vector<BodyId> a;
-  AUREOLE_RETURN_IF_ERROR(DecodeIds("edge_a", in.edge_a(), kMaxEdges, false, &a));
-  AUREOLE_RETURN_IF_ERROR(CheckColumn("edge_step", in.edge_step_size(), 1, a.size(), false));
+  AUREOLE_RETURN_IF_ERROR(DecodeIds("graph.edge_a", in.edge_a(), kMaxEdges, false, &a));
+  AUREOLE_RETURN_IF_ERROR(CheckColumn("graph.edge_step", in.edge_step_size(), 1, a.size(), false));
   out->reserve(a.size());
   for (size_t i = 0; i < a.size(); ++i) {
     const uint64_t b = a[i] + in.edge_step(static_cast<int>(i));
-    if (b <= a[i]) return Bad("edge_step", absl::StrCat("edge of body ", a[i], " to body ", b));
+    if (b <= a[i]) return Bad("graph.edge_step", absl::StrCat("edge of body ", a[i], " to body ", b));
     out->push_back({a[i], b});
   }
   return absl::OkStatus();
 }
 
-absl::Status DecodeFragment(const v1::Frame::Fragment& in, Fragment* out) {
-  AUREOLE_RETURN_IF_ERROR(DecodeIds("fragment.known", in.known(), kMaxAuras, true, &out->known));
-  if (out->known.empty()) return Bad("fragment.known", "is empty");
-  out->id = in.id();
-  out->bodies = in.bodies();
-  if (out->id == 0 || out->id > out->known[0]) return Bad("fragment.id", absl::StrCat(out->id, " is no smallest id"));
-  if (out->bodies < out->known.size()) return Bad("fragment.bodies", absl::StrCat(out->bodies, ", more are named"));
-  AUREOLE_RETURN_IF_ERROR(CheckCount("fragment.home", in.home_size(), kMaxRegions));
-  AUREOLE_RETURN_IF_ERROR(CheckColumn("fragment.mass", in.mass_size(), 1, in.home_size(), false));
-  for (int i = 0; i < in.home_size(); ++i) {
-    if (in.home(i) >= kMaxRegions || (i > 0 && in.home(i) <= in.home(i - 1))) {
-      return Bad("fragment.home", absl::StrCat(in.home(i), " is out of range or order"));
-    }
-    if (!std::isfinite(in.mass(i)) || in.mass(i) < 0) return Bad("fragment.mass", absl::StrCat(in.mass(i), " kg"));
-    out->mass_by_home.emplace_back(static_cast<RegionId>(in.home(i)), in.mass(i));
+absl::Status DecodeLate(const v1::Frame::Graph& in, std::vector<LateAura>* out) {
+  std::vector<BodyId> ids;
+  AUREOLE_RETURN_IF_ERROR(DecodeIds("graph.late_id", in.late_id(), kMaxAuras, false, &ids));
+  AUREOLE_RETURN_IF_ERROR(CheckColumn("graph.late_to", in.late_to_size(), 1, ids.size(), false));
+  AUREOLE_RETURN_IF_ERROR(CheckColumn("graph.late_box", in.late_box_size(), 6, ids.size(), false));
+  out->resize(ids.size());
+  for (size_t i = 0; i < ids.size(); ++i) {
+    LateAura& l = (*out)[i];
+    l.aura.id = ids[i];
+    AUREOLE_RETURN_IF_ERROR(DecodeKnownRegion("graph.late_to", in.late_to(static_cast<int>(i)), &l.to));
+    AUREOLE_RETURN_IF_ERROR(DecodeBox("graph.late_box", ids[i], in.late_box().data() + 6 * i, &l.aura.box));
   }
-  return DecodeRegion("fragment.gives_back", in.gives_back(), &out->gives_back);
+  return absl::OkStatus();
+}
+
+absl::Status DecodeRegions(const char* field, const google::protobuf::RepeatedField<uint32_t>& in,
+                           std::vector<RegionId>* out) {
+  AUREOLE_RETURN_IF_ERROR(CheckCount(field, in.size(), kMaxRegions));
+  for (uint32_t r : in) AUREOLE_RETURN_IF_ERROR(DecodeKnownRegion(field, r, &out->emplace_back()));
+  return absl::OkStatus();
+}
+
+absl::Status DecodeGraph(const v1::Frame::Graph& in, Graph* out) {
+  AUREOLE_RETURN_IF_ERROR(DecodeKnownRegion("graph.of", in.of(), &out->of));
+  AUREOLE_RETURN_IF_ERROR(DecodeEdges(in, &out->edges));
+  AUREOLE_RETURN_IF_ERROR(CheckCount("graph.fragment", in.fragment_size(), kMaxFragments));
+  out->fragments.resize(in.fragment_size());
+  for (int i = 0; i < in.fragment_size(); ++i) {
+    AUREOLE_RETURN_IF_ERROR(DecodeFragment(in.fragment(i), &out->fragments[i]));
+  }
+  AUREOLE_RETURN_IF_ERROR(DecodeLate(in, &out->late));
+  AUREOLE_RETURN_IF_ERROR(DecodeRegions("graph.opened", in.opened(), &out->opened));
+  return DecodeRegions("graph.closed", in.closed(), &out->closed);
 }
 
 absl::Status DecodeVector(const char* field, const Doubles& in, Vec3* out) {
@@ -251,7 +318,10 @@ bool HasUnknownFields(const google::protobuf::Message& message) {
 
 bool AnyUnknownFields(const v1::Frame& frame) {
   bool any = HasUnknownFields(frame);
-  for (const auto& f : frame.fragment()) any |= HasUnknownFields(f);
+  for (const auto& g : frame.graph()) {
+    any |= HasUnknownFields(g);
+    for (const auto& f : g.fragment()) any |= HasUnknownFields(f);
+  }
   for (const auto& t : frame.transfer()) {
     any |= HasUnknownFields(t);
     for (const auto& p : t.pending()) any |= HasUnknownFields(p);
@@ -262,24 +332,19 @@ bool AnyUnknownFields(const v1::Frame& frame) {
 }  // namespace
 
 std::string EncodeFrame(const Frame& frame) {
-  AUREOLE_CHECK(
-      frame.auras.size() <= kMaxAuras && frame.gone.size() <= kMaxAuras && frame.away.size() <= kMaxAuras &&
-          frame.away_gone.size() <= kMaxAuras && frame.edges.size() <= kMaxEdges &&
-          frame.fragments.size() <= kMaxFragments && frame.transfers.size() <= kMaxTransfers,
-      "frame of region %d, tick %lld is beyond link_limits.h: %zu auras, %zu edges, %zu fragments, %zu transfers",
-      frame.from, static_cast<long long>(frame.tick), frame.auras.size(), frame.edges.size(), frame.fragments.size(),
-      frame.transfers.size());
+  AUREOLE_CHECK(frame.auras.size() <= kMaxAuras && frame.gone.size() <= kMaxAuras && frame.away.size() <= kMaxAuras &&
+                    frame.away_gone.size() <= kMaxAuras && frame.graphs.size() <= kMaxRegions &&
+                    std::all_of(frame.graphs.begin(), frame.graphs.end(), WithinLimits) &&
+                    frame.transfers.size() <= kMaxTransfers,
+                "frame of region %d, tick %lld is beyond link_limits.h: %zu auras, %zu graphs, %zu transfers",
+                frame.from, static_cast<long long>(frame.tick), frame.auras.size(), frame.graphs.size(),
+                frame.transfers.size());
   v1::Frame out;
-  out.set_phase(static_cast<uint64_t>(frame.tick) * 4 + static_cast<uint64_t>(frame.round));
+  out.set_phase(static_cast<uint64_t>(frame.tick) * 8 + static_cast<uint64_t>(frame.round));
   EncodeAuras(frame.auras, &out);
   IdWriter gone(out.mutable_gone_id());
   for (BodyId id : frame.gone) gone.Add(id);
-  IdWriter edges(out.mutable_edge_a());
-  for (const Edge& e : frame.edges) {
-    edges.Add(e.a);
-    out.add_edge_step(e.b - e.a);
-  }
-  for (const Fragment& f : frame.fragments) EncodeFragment(f, out.add_fragment());
+  for (const Graph& g : frame.graphs) EncodeGraph(g, out.add_graph());
   for (const Transfer& t : frame.transfers) EncodeTransfer(t, out.add_transfer());
   IdWriter away(out.mutable_away_id());
   for (const Away& a : frame.away) {
@@ -305,18 +370,15 @@ absl::StatusOr<Frame> DecodeFrame(std::string_view bytes, RegionId from, RegionI
 
   Frame out;
   out.from = from;
-  out.to = to;
-  out.round = static_cast<int>(in.phase() % 4);
-  out.tick = static_cast<Tick>(in.phase() / 4);
-  if (out.round > 2) return Bad("phase", "no round 3");
+  out.to = {to};
+  out.round = static_cast<int>(in.phase() % 8);
+  out.tick = static_cast<Tick>(in.phase() / 8);
+  if (out.round > kTransfers) return Bad("phase", absl::StrCat("no round ", out.round));
   AUREOLE_RETURN_IF_ERROR(DecodeAuras(in, &out.auras));
   AUREOLE_RETURN_IF_ERROR(DecodeIds("gone_id", in.gone_id(), kMaxAuras, false, &out.gone));
-  AUREOLE_RETURN_IF_ERROR(DecodeEdges(in, &out.edges));
-  AUREOLE_RETURN_IF_ERROR(CheckCount("fragment", in.fragment_size(), kMaxFragments));
-  out.fragments.resize(in.fragment_size());
-  for (int i = 0; i < in.fragment_size(); ++i) {
-    AUREOLE_RETURN_IF_ERROR(DecodeFragment(in.fragment(i), &out.fragments[i]));
-  }
+  AUREOLE_RETURN_IF_ERROR(CheckCount("graph", in.graph_size(), kMaxRegions));
+  out.graphs.resize(in.graph_size());
+  for (int i = 0; i < in.graph_size(); ++i) AUREOLE_RETURN_IF_ERROR(DecodeGraph(in.graph(i), &out.graphs[i]));
   AUREOLE_RETURN_IF_ERROR(CheckCount("transfer", in.transfer_size(), kMaxTransfers));
   out.transfers.resize(in.transfer_size());
   for (int i = 0; i < in.transfer_size(); ++i) {

@@ -8,7 +8,7 @@
 namespace aureole {
 
 // Of the link protocol. Grows with every change that an older server would not understand.
-inline constexpr uint32_t kPeerProtocolVersion = 1;
+inline constexpr uint32_t kPeerProtocolVersion = 2;
 
 // Bytes of one message on the wire; more is refused by gRPC before it is read.
 inline constexpr size_t kMaxMessageBytes = size_t{1} << 20;
@@ -25,8 +25,8 @@ inline constexpr size_t kMaxTransfers = size_t{1} << 16;
 inline constexpr size_t kMaxTransferBodies = size_t{1} << 17;  // of one cluster
 inline constexpr size_t kMaxPending = size_t{1} << 16;         // inputs that travel with one cluster
 
-// A received frame is acknowledged at least this often, with the next frame that goes back. Until then its sender keeps
-// it: half a second of frames at three a tick.
+// A received frame is acknowledged at least this often, with the next frame that goes back or alone. Until then its
+// sender keeps it: half a second of frames at three a tick.
 inline constexpr uint64_t kAcknowledgeEvery = 64;
 
 // Wait before dialling again, milliseconds; doubled up to the maximum, reset when a frame arrives.

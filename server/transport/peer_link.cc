@@ -287,6 +287,7 @@ absl::Status PeerLink::Apply(LinkStream* stream, const v1::PeerMessage& message,
       ++stats_.frames_received;
       backoff_ms_ = kMinBackoffMs;
       options_.deliver(std::move(*frame));
+      Pump(stream);  // an acknowledgement may be due
       return absl::OkStatus();
     case LinkReceiver::Verdict::kDuplicate:
       ++stats_.duplicates;
@@ -346,13 +347,24 @@ void PeerLink::LogOnce(const std::string& why) {
 
 // Holds the mutex. Starts the next write, if there is one and none is in flight.
 void PeerLink::Pump(LinkStream* stream) {
-  if (stream->ended || !stream->open || stream->writing || stream->queue.empty()) return;
-  const auto& [sequence, frame] = stream->queue.front();
+  if (stream->ended || !stream->open || stream->writing) return;
+  const bool acknowledge = receiver_.applied() - told_ >= kAcknowledgeEvery;
+  if (stream->queue.empty() && !acknowledge) return;
   v1::PeerMessage& out = stream->out;
   out.Clear();
+  if (acknowledge) out.set_applied(told_ = receiver_.applied());
+  if (!stream->queue.empty()) PutFrame(stream);
+  stats_.bytes_sent += static_cast<int64_t>(out.ByteSizeLong());
+  stream->writing = true;
+  stream->StartWriting(&out);
+}
+
+// Holds the mutex. Puts the next frame, or a part of it, into the message.
+void PeerLink::PutFrame(LinkStream* stream) {
+  v1::PeerMessage& out = stream->out;
+  const auto& [sequence, frame] = stream->queue.front();
   if (!stream->sequence_said) out.set_sequence(sequence);
   stream->sequence_said = true;
-  if (receiver_.applied() - told_ >= kAcknowledgeEvery) out.set_applied(told_ = receiver_.applied());
   const size_t part = std::min(kPartBytes, frame->size() - stream->written);
   out.set_frame(frame->data() + stream->written, part);
   stream->written += part;
@@ -363,9 +375,6 @@ void PeerLink::Pump(LinkStream* stream) {
     stream->queue.pop_front();
     ++stats_.frames_sent;
   }
-  stats_.bytes_sent += static_cast<int64_t>(out.ByteSizeLong());
-  stream->writing = true;
-  stream->StartWriting(&out);
 }
 
 // Holds the mutex.

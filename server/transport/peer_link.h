@@ -137,6 +137,7 @@ class PeerLink {
   absl::StatusOr<bool> Assemble(LinkStream* stream, v1::PeerMessage* message, std::string* frame) const;
   absl::Status Apply(LinkStream* stream, const v1::PeerMessage& message, Frame* frame);
   void Pump(LinkStream* stream);
+  void PutFrame(LinkStream* stream);
   void Connect();
   void Redial();
 

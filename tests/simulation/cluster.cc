@@ -78,9 +78,7 @@ class Run {
       for (const Input& i : region.TakeAccepted()) accepted_[i.tick].push_back(i);
       for (Frame& f : out) {
         const auto frame = std::make_shared<const Frame>(std::move(f));
-        for (RegionId p : region.peers()) {
-          if (frame->to == p || frame->to == kEveryone) network_.Send(r, p, frame);
-        }
+        for (RegionId p : frame->to) network_.Send(r, p, frame);
       }
       if (region.tick() > before) Record(region, region.tick(), &after_step_, &Run::CheckAfterStep);
     }
@@ -204,6 +202,7 @@ class Run {
       verdict_.returns += x.returns_out;
       verdict_.largest_cluster = std::max(verdict_.largest_cluster, x.largest_cluster);
       verdict_.longest_chain = std::max(verdict_.longest_chain, x.longest_chain);
+      verdict_.graphs_again = std::max(verdict_.graphs_again, x.graphs_again);
       verdict_.violations += x.violations;
       verdict_.home_crossings += x.home_crossings;
     }

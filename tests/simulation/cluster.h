@@ -30,6 +30,7 @@ struct Verdict {
   int64_t transfers = 0, touching_transfers = 0, bodies_moved = 0, returns = 0;
   int64_t wakes = 0;
   int64_t largest_cluster = 0, longest_chain = 0;
+  int64_t graphs_again = 0;  // ticks in which a box was told late (k = 0)
   int64_t spawns = 0, live_inputs = 0;
   int64_t reconnects = 0, duplicates = 0, stalls = 0;
   int64_t violations = 0;

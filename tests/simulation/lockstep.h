@@ -64,18 +64,17 @@ class Lockstep {
  private:
   void Advance(Region& r) {
     std::vector<Frame> out;
-    if (r.phase() == Phase::kBegin && r.self() == 0) last_.clear();
     r.Advance(&out);
     for (Frame& f : out) {
-      for (RegionId p : r.peers()) {
-        if (f.to != p && f.to != kEveryone) continue;
+      for (RegionId p : f.to) {
         const absl::Status s = regions_[p]->Receive(f);
         if (!s.ok()) {
           std::fprintf(stderr, "%s\n", std::string(s.message()).c_str());
           std::abort();
         }
       }
-      last_.push_back(std::move(f));
+      if (!last_.empty() && f.tick > last_.front().tick) last_.clear();
+      if (last_.empty() || f.tick == last_.front().tick) last_.push_back(std::move(f));
     }
   }
 

@@ -20,7 +20,7 @@ namespace {
 struct Totals {
   int64_t seeds = 0, bad = 0, over_100_touching = 0;
   int64_t transfers = 0, touching = 0, returns = 0, wakes = 0, spawns = 0, live = 0;
-  int64_t reconnects = 0, duplicates = 0, stalls = 0, violations = 0;
+  int64_t reconnects = 0, duplicates = 0, stalls = 0, violations = 0, graphs_again = 0;
   int64_t largest_cluster = 0;
   std::map<int64_t, int64_t> chains;  // longest chain -> seeds
   std::map<std::string, int64_t> kinds;
@@ -46,6 +46,7 @@ void Add(const Scenario& s, const Verdict& v, Totals* t) {
   t->duplicates += v.duplicates;
   t->stalls += v.stalls;
   t->violations += v.violations;
+  t->graphs_again += v.graphs_again;
   t->largest_cluster = std::max(t->largest_cluster, v.largest_cluster);
   ++t->chains[v.longest_chain];
   ++t->kinds["k=" + std::to_string(s.world.exchange.k) + " " + PolicyName(s.world)];
@@ -110,8 +111,9 @@ int RunAll(const Options& o) {
   for (const auto& [chain, n] : totals.chains) {
     std::printf(" %lld in %lld seeds;", static_cast<long long>(chain), static_cast<long long>(n));
   }
-  std::printf("\n  wakes %lld, spawns %lld, live inputs %lld\n", static_cast<long long>(totals.wakes),
-              static_cast<long long>(totals.spawns), static_cast<long long>(totals.live));
+  std::printf("\n  wakes %lld, spawns %lld, live inputs %lld, ticks with late boxes %lld\n",
+              static_cast<long long>(totals.wakes), static_cast<long long>(totals.spawns),
+              static_cast<long long>(totals.live), static_cast<long long>(totals.graphs_again));
   std::printf("  reconnects %lld, duplicates %lld, stalls %lld, broken horizons %lld\n",
               static_cast<long long>(totals.reconnects), static_cast<long long>(totals.duplicates),
               static_cast<long long>(totals.stalls), static_cast<long long>(totals.violations));

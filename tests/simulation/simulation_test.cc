@@ -10,6 +10,7 @@ namespace {
 // Runs seeds until one is bad; adds up what they went through.
 struct Sum {
   int64_t bad = 0, touching = 0, chains_of_3 = 0, chains_of_4 = 0, wakes = 0, returns = 0, reconnects = 0;
+  int64_t graphs_again = 0;
   std::string first;
 };
 Sum RunSeeds(uint64_t first, int seeds, const ScenarioOptions& options, const Faults& faults, bool stop = true) {
@@ -24,6 +25,7 @@ Sum RunSeeds(uint64_t first, int seeds, const ScenarioOptions& options, const Fa
     sum.wakes += v.wakes;
     sum.returns += v.returns;
     sum.reconnects += v.reconnects;
+    sum.graphs_again += v.graphs_again;
     if (!v.ok) {
       sum.first =
           "seed " + std::to_string(seed) + " tick " + std::to_string(v.tick) + " " + v.invariant + ": " + v.message;
@@ -52,6 +54,7 @@ TEST(ClusterSimulation, CornersAndNarrowCellsHoldInTheSynchronousExchange) {
     const Sum sum = RunSeeds(5000, 300, options, Faults::None());
     EXPECT_EQ(sum.bad, 0) << layout << ": " << sum.first;
     EXPECT_GT(sum.chains_of_3, 10) << layout;
+    EXPECT_GT(sum.graphs_again, 300) << layout;
   }
 }
 

@@ -55,7 +55,7 @@ TEST_P(DelayedExchange, BodyInFlightIsShownToThirdRegionsWhereItIs) {
     int told = 0;
     for (const Frame& f : split.LastFrames()) {
       for (const Aura& a : f.auras) {
-        if (f.to != 2) continue;
+        if (f.to != std::vector<RegionId>{2}) continue;
         ++told;
         EXPECT_TRUE(a.box == box) << "tick " << n << " from region " << f.from;
       }

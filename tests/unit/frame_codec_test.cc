@@ -30,14 +30,21 @@ Aura MakeAura(BodyId id, bool predicted) {
 Frame MakeFrame(bool predicted) {
   Frame f;
   f.from = 1;
-  f.to = 2;
+  f.to = {2};
   f.tick = 123456;
-  f.round = predicted ? 0 : 2;
+  f.round = predicted ? kBoxes : kTransfers;
   for (BodyId id : {7ull, 9ull, 1ull << 62, ~0ull, 3ull}) f.auras.push_back(MakeAura(id, predicted));
   f.gone = {5, ~0ull, 2};
-  f.edges = {{1, ~0ull}, {7, 9}, {2, 3}};
-  f.fragments.push_back({{4, 8, 15}, 2, 9, {{0, 12.5}, {3, 0.1}}, kNoRegion});
-  f.fragments.push_back({{1ull << 63}, 1, 1, {}, 4});
+  f.graphs.resize(2);
+  Graph& g = f.graphs[0];
+  g.of = 0;
+  g.edges = {{1, ~0ull}, {7, 9}, {2, 3}};
+  g.fragments.push_back({{4, 8, 15}, 2, 9, {{0, 12.5}, {3, 0.1}}, kNoRegion});
+  g.fragments.push_back({{1ull << 63}, 1, 1, {}, 4});
+  g.late = {{2, MakeAura(~0ull, false)}, {3, MakeAura(6, false)}};
+  f.graphs[1].of = 3;
+  f.graphs[1].opened = {0, 7};
+  f.graphs[1].closed = {2};
   Transfer t;
   t.ids = {11, 1ull << 62};
   t.epochs = {0, 4000000000u};
@@ -62,14 +69,8 @@ Frame MakeFrame(bool predicted) {
 
 bool SameBits(const Vec3& a, const Vec3& b) { return std::memcmp(a.data(), b.data(), 3 * sizeof(double)) == 0; }
 
-void ExpectSame(const Frame& a, const Frame& b) {
-  EXPECT_EQ(a.tick, b.tick);
-  EXPECT_EQ(a.round, b.round);
-  ASSERT_EQ(a.auras.size(), b.auras.size());
-  for (size_t i = 0; i < a.auras.size(); ++i) {
-    EXPECT_EQ(a.auras[i], b.auras[i]);
-  }
-  EXPECT_EQ(a.gone, b.gone);
+void ExpectSame(const Graph& a, const Graph& b) {
+  EXPECT_EQ(a.of, b.of);
   EXPECT_EQ(a.edges, b.edges);
   ASSERT_EQ(a.fragments.size(), b.fragments.size());
   for (size_t i = 0; i < a.fragments.size(); ++i) {
@@ -79,6 +80,25 @@ void ExpectSame(const Frame& a, const Frame& b) {
     EXPECT_EQ(a.fragments[i].mass_by_home, b.fragments[i].mass_by_home);
     EXPECT_EQ(a.fragments[i].gives_back, b.fragments[i].gives_back);
   }
+  ASSERT_EQ(a.late.size(), b.late.size());
+  for (size_t i = 0; i < a.late.size(); ++i) {
+    EXPECT_EQ(a.late[i].to, b.late[i].to);
+    EXPECT_EQ(a.late[i].aura, b.late[i].aura);
+  }
+  EXPECT_EQ(a.opened, b.opened);
+  EXPECT_EQ(a.closed, b.closed);
+}
+
+void ExpectSame(const Frame& a, const Frame& b) {
+  EXPECT_EQ(a.tick, b.tick);
+  EXPECT_EQ(a.round, b.round);
+  ASSERT_EQ(a.auras.size(), b.auras.size());
+  for (size_t i = 0; i < a.auras.size(); ++i) {
+    EXPECT_EQ(a.auras[i], b.auras[i]);
+  }
+  EXPECT_EQ(a.gone, b.gone);
+  ASSERT_EQ(a.graphs.size(), b.graphs.size());
+  for (size_t i = 0; i < a.graphs.size(); ++i) ExpectSame(a.graphs[i], b.graphs[i]);
   ASSERT_EQ(a.transfers.size(), b.transfers.size());
   for (size_t i = 0; i < a.transfers.size(); ++i) {
     const Transfer &x = a.transfers[i], &y = b.transfers[i];
@@ -109,17 +129,17 @@ v1::Frame Parsed(const Frame& frame) {
 TEST(FrameCodec, FrameSurvivesBitForBit) {
   for (bool predicted : {false, true}) {
     const Frame frame = MakeFrame(predicted);
-    const absl::StatusOr<Frame> back = DecodeFrame(EncodeFrame(frame), frame.from, frame.to);
+    const absl::StatusOr<Frame> back = DecodeFrame(EncodeFrame(frame), frame.from, frame.to[0]);
     ASSERT_TRUE(back.ok()) << back.status();
     EXPECT_EQ(back->from, 1);
-    EXPECT_EQ(back->to, 2);
+    EXPECT_EQ(back->to, std::vector<RegionId>{2});
     ExpectSame(frame, *back);
   }
 }
 
 TEST(FrameCodec, EncodingDoesNotDependOnTheReceiver) {
   Frame a = MakeFrame(false), b = a;
-  b.to = kEveryone;
+  b.to = {0, 2};
   EXPECT_EQ(EncodeFrame(a), EncodeFrame(b));
 }
 
@@ -167,15 +187,24 @@ TEST(FrameCodec, RefusesWhatNoRegionSends) {
   refused("frame.aura_energy", [](v1::Frame* f) { f->add_aura_energy(1); });
   refused("frame.aura_mass", [](v1::Frame* f) { f->set_aura_mass(0, -1); });
   refused("frame.gone_id", [](v1::Frame* f) { f->set_gone_id(0, 0); });
-  refused("frame.edge_step", [](v1::Frame* f) { f->set_edge_step(0, 0); });
-  refused("frame.edge_step", [](v1::Frame* f) { f->add_edge_step(1); });
-  refused("frame.fragment.known", [](v1::Frame* f) { f->mutable_fragment(0)->clear_known(); });
-  refused("frame.fragment.known", [](v1::Frame* f) { f->mutable_fragment(0)->set_known(1, -1); });
-  refused("frame.fragment.id", [](v1::Frame* f) { f->mutable_fragment(0)->set_id(5); });
-  refused("frame.fragment.bodies", [](v1::Frame* f) { f->mutable_fragment(0)->set_bodies(2); });
-  refused("frame.fragment.home", [](v1::Frame* f) { f->mutable_fragment(0)->set_home(1, 0); });
-  refused("frame.fragment.mass", [](v1::Frame* f) { f->mutable_fragment(0)->set_mass(1, -1); });
-  refused("frame.fragment.gives_back", [](v1::Frame* f) { f->mutable_fragment(1)->set_gives_back(1u << 31); });
+  refused("frame.graph.edge_step", [](v1::Frame* f) { f->mutable_graph(0)->set_edge_step(0, 0); });
+  refused("frame.graph.edge_step", [](v1::Frame* f) { f->mutable_graph(0)->add_edge_step(1); });
+  refused("frame.graph.of", [](v1::Frame* f) { f->mutable_graph(0)->set_of(kMaxRegions); });
+  refused("frame.graph.late_to", [](v1::Frame* f) { f->mutable_graph(0)->set_late_to(0, kMaxRegions); });
+  refused("frame.graph.late_to", [](v1::Frame* f) { f->mutable_graph(0)->add_late_to(1); });
+  refused("frame.graph.late_id", [](v1::Frame* f) { f->mutable_graph(0)->set_late_id(0, 0); });
+  refused("frame.graph.late_box", [](v1::Frame* f) { f->mutable_graph(0)->set_late_box(0, 1e9f); });
+  refused("frame.graph.opened", [](v1::Frame* f) { f->mutable_graph(1)->set_opened(0, kMaxRegions); });
+  refused("frame.graph.closed", [](v1::Frame* f) { f->mutable_graph(1)->set_closed(0, kMaxRegions); });
+  refused("frame.graph.fragment.known", [](v1::Frame* f) { f->mutable_graph(0)->mutable_fragment(0)->clear_known(); });
+  refused("frame.graph.fragment.known",
+          [](v1::Frame* f) { f->mutable_graph(0)->mutable_fragment(0)->set_known(1, -1); });
+  refused("frame.graph.fragment.id", [](v1::Frame* f) { f->mutable_graph(0)->mutable_fragment(0)->set_id(5); });
+  refused("frame.graph.fragment.bodies", [](v1::Frame* f) { f->mutable_graph(0)->mutable_fragment(0)->set_bodies(2); });
+  refused("frame.graph.fragment.home", [](v1::Frame* f) { f->mutable_graph(0)->mutable_fragment(0)->set_home(1, 0); });
+  refused("frame.graph.fragment.mass", [](v1::Frame* f) { f->mutable_graph(0)->mutable_fragment(0)->set_mass(1, -1); });
+  refused("frame.graph.fragment.gives_back",
+          [](v1::Frame* f) { f->mutable_graph(0)->mutable_fragment(1)->set_gives_back(1u << 31); });
   refused("frame.transfer.id", [](v1::Frame* f) { f->mutable_transfer(0)->set_id(1, 0); });
   refused("frame.transfer.epoch", [](v1::Frame* f) { f->mutable_transfer(0)->add_epoch(1); });
   refused("frame.transfer.cause", [](v1::Frame* f) { f->mutable_transfer(0)->set_cause(4); });

@@ -13,6 +13,7 @@ namespace aureole {
 namespace {
 
 using sim::Lockstep;
+using sim::Undivided;
 using testing::HasSubstr;
 
 BodySpec Ball(BodyId id, double x, double vx = 0, bool asleep = false) {
@@ -43,8 +44,59 @@ TEST(Region, BodyFarFromTheBorderCostsNoAuraTestAndNoByte) {
   EXPECT_EQ(s.region(0).stats().aura_tests, 0);
   EXPECT_EQ(AurasSent(s), 0);
   for (const Frame& f : s.LastFrames()) {
-    EXPECT_TRUE(f.auras.empty() && f.gone.empty() && f.edges.empty() && f.fragments.empty() && f.transfers.empty());
+    EXPECT_TRUE(f.auras.empty() && f.gone.empty() && f.graphs.empty() && f.transfers.empty());
   }
+}
+
+World FourColumns() {
+  World w(*Layout::Columns(std::array{-10.0, 0.0, 10.0}));
+  w.environment.gravity = Vec3::Zero();
+  return w;
+}
+
+int BoxFrames(const Lockstep& s) {
+  int n = 0;
+  for (const Frame& f : s.LastFrames()) n += f.round == kBoxes;
+  return n;
+}
+
+TEST(Region, BoxesGoOnlyBetweenRegionsThatBodiesAreNear) {
+  World w = FourColumns();
+  w.bodies = {Ball(1, -0.7, 0)};
+  Lockstep s(w);
+  s.RunTo(1);
+  EXPECT_EQ(BoxFrames(s), 0);
+  s.RunTo(2);
+  EXPECT_EQ(BoxFrames(s), 2) << "regions 1 and 2, each to the other";
+  EXPECT_EQ(AurasSent(s), 0) << "near, but it does not touch";
+  EXPECT_EQ(s.region(0).stats().graphs_again, 0);
+}
+
+TEST(Region, RegionsCloseToEachOtherWhenNothingHasBeenNearForAWhile) {
+  World w = FourColumns();
+  w.bodies = {Ball(1, -0.7, -8)};
+  Lockstep s(w);
+  s.RunTo(60);
+  EXPECT_EQ(BoxFrames(s), 2);
+  s.RunTo(80);
+  EXPECT_EQ(BoxFrames(s), 2) << "it has come near region 0 meanwhile, and has long left region 2";
+  s.RunTo(200);
+  EXPECT_EQ(BoxFrames(s), 0);
+}
+
+TEST(Region, BodyThatComesTooFastIsToldLateAndTheGraphsAreMadeAgain) {
+  World w = FourColumns();
+  // In one tick from the middle of a column over its border, where another lies in wait: exact only if it is told.
+  w.bodies = {Ball(1, -5, 331.25), Ball(2, 0.85, 0)};
+  Lockstep s(w);
+  Undivided whole(w);
+  s.RunTo(1);
+  for (RegionId r = 0; r < 4; ++r) EXPECT_EQ(s.region(r).stats().graphs_again, 0);
+  s.RunTo(2);
+  for (RegionId r = 0; r < 4; ++r) EXPECT_EQ(s.region(r).stats().graphs_again, 1) << "all do the same";
+  s.RunTo(20);
+  whole.RunTo(20);
+  EXPECT_EQ(s.Hash(), whole.Hash());
 }
 
 TEST(Region, SleepingBodyOnTheBorderIsToldOnce) {
@@ -159,15 +211,30 @@ TEST(Region, FrameOfAStrangerIsRefusedWithAReasonAndChangesNothing) {
   const uint64_t hash = s.Hash();
   Frame f;
   f.from = 7;
-  f.to = 0;
+  f.to = {0};
   EXPECT_THAT(std::string(s.region(0).Receive(f).message()), HasSubstr("frame.from: 7 is no peer"));
   f.from = 1;
-  f.to = 1;
+  f.to = {1};
   EXPECT_THAT(std::string(s.region(0).Receive(f).message()), HasSubstr("frame.to"));
-  f.to = 0;
+  f.to = {0};
   f.tick = 9;
+  EXPECT_THAT(std::string(s.region(0).Receive(f).message()), HasSubstr("too far ahead"));
+  f.tick = 3;
   EXPECT_THAT(std::string(s.region(0).Receive(f).message()), HasSubstr("cannot follow"));
   f.tick = 4;
+  f.round = kGraphsOn;
+  EXPECT_THAT(std::string(s.region(0).Receive(f).message()), HasSubstr("is not for region 1 to send"));
+  f.round = kGraphs;
+  f.gone = {5};
+  EXPECT_THAT(std::string(s.region(0).Receive(f).message()), HasSubstr("frame.auras: not in this round"));
+  f.gone.clear();
+  f.graphs.emplace_back().of = 2;
+  EXPECT_THAT(std::string(s.region(0).Receive(f).message()), HasSubstr("frame.graphs.of"));
+  f.graphs.front().of = 1;
+  f.graphs.front().opened = {1};
+  EXPECT_THAT(std::string(s.region(0).Receive(f).message()), HasSubstr("frame.graphs.opened"));
+  f.graphs.clear();
+  f.round = kBoxes;
   Aura a;
   a.id = 5;
   a.box.min[0] = 2;
