@@ -45,8 +45,9 @@ uint64_t Injected(const World& world) {
 
 std::string DescribeExchange(const Exchange& exchange) {
   if (exchange.k == 0) {
-    return absl::StrFormat("synchronous (k = 0), nothing is predicted; home again at %g m of space, after %d ticks",
-                           exchange.return_gap, exchange.Dwell());
+    return absl::StrFormat(
+        "synchronous (k = 0), nothing is predicted; home again %g m outside, at %g m of space, after %d ticks",
+        exchange.home_slack, exchange.return_gap, exchange.Dwell());
   }
   return absl::StrFormat("fixed delay of k = %d ticks, aura policy `%s`", exchange.k,
                          exchange.policy == AuraPolicy::kReach ? "reach" : "tolerance");

@@ -30,6 +30,7 @@ inline constexpr Range kFriction{0, 10, ""};
 inline constexpr Range kShare{0, 1, ""};  // restitution, damping
 inline constexpr Range kWeight{0, 1e9, ""};
 inline constexpr Range kReturnGap{0, 100, "m"};
+inline constexpr Range kHomeSlack{0, 100, "m"};
 // In thousandths of a body per second, so that spawn ticks are exact in integers.
 inline constexpr Range kRate{1e-3, 1e5, "bodies/s"};
 inline constexpr Range kDegrees{-360, 360, "degrees"};

@@ -333,23 +333,32 @@ class SyncExchange final : public Protocol {
                             std::back_inserter(c.wire.known));
       for (BodyId id : c.members) {
         const BodyView v = h_.engine->View(id);
-        AddMass(&c.wire.mass_by_home, h_.world.layout.Home(v.centre), v.mass);
+        AddMass(&c.wire.mass_by_home, Stays(v) ? h_.self : h_.world.layout.Home(v.centre), v.mass);
       }
       c.wire.gives_back = BoundaryTraverse(c);
       components_.push_back(std::move(c));
     }
   }
 
-  // The paper's BT (Algorithm 2), by R20: an island goes home when none of it meets this region, nothing foreign is
-  // near, and it has been here for a while. Returns its new owner, or kNoRegion.
+  // A body that has hardly left counts as at home: who sways over the border, or is struck across it, moves less often.
+  bool Stays(const BodyView& v) const { return h_.rect.Gap(v.box) <= h_.world.exchange.home_slack; }
+
+  // The paper's BT (Algorithm 2), by R20: an island goes home when none of it meets this region, nothing that is
+  // foreign or stays here is near, and it has been here for a while. Returns its new owner, or kNoRegion.
   RegionId BoundaryTraverse(const Component& c) const {
     for (BodyId id : c.members) {
       if (now() - h_.held.at(id).arrived < h_.world.exchange.Dwell()) return kNoRegion;
-      if (h_.rect.Gap(h_.engine->View(id).box) <= 0) return kNoRegion;
+      if (Stays(h_.engine->View(id))) return kNoRegion;
     }
     const double gap = h_.world.exchange.return_gap;
+    std::vector<BodyId> near;
     for (BodyId id : c.members) {
       const Box box = h_.engine->View(id).box;
+      near.clear();
+      h_.engine->Query(box.Inflated(gap), &near);
+      for (BodyId other : near) {
+        if (Stays(h_.engine->View(other))) return kNoRegion;
+      }
       for (const Foreign& f : foreign_) {
         if (f.box.min.x() > box.max.x() + gap) break;
         if (Gap(f.box, box) <= gap) return kNoRegion;

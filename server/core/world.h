@@ -24,13 +24,15 @@ enum class AuraPolicy : uint8_t {
 struct Exchange {
   int k = 0;
   AuraPolicy policy = AuraPolicy::kTolerance;
-  // k = 0 (R20): D_ret in metres.
+  // k = 0 (R20), metres: an island goes home when nothing that is foreign or stays is nearer (D_ret); a body stays
+  // while its box is no further outside of its owner's region than the slack. Both only decide how often bodies move.
   double return_gap = 0.125;
-  // Ticks that a body stays at least before an island gives it back; < 0: 4 at k = 0 (R20), 4k at k >= 1 (R6).
+  double home_slack = 0.2;
+  // Ticks that a body stays at least before an island gives it back; < 0: 8 at k = 0 (R20), 4k at k >= 1 (R6).
   int dwell = -1;
   // k >= 1: what a solver may move a body in one tick beyond its speed, to push it out of another; metres.
   double recovery = 0.02;
-  Tick Dwell() const { return dwell >= 0 ? dwell : 4 * std::max(1, k); }
+  Tick Dwell() const { return dwell >= 0 ? dwell : k == 0 ? 8 : 4 * k; }
   // k >= 1: replaces ComputeMargins, to measure what each margin is for.
   std::optional<Margins> margins;
 };

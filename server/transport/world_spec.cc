@@ -142,9 +142,12 @@ Exchange ReadExchange(const v1::ExchangeSpec& spec, SpecCheck* check) {
                 "has no meaning in the synchronous exchange; give a delay of 1 or more, or leave it out");
   }
   if (spec.has_return_gap()) out.return_gap = check->In(limits::kReturnGap, path / "return_gap", spec.return_gap());
+  if (spec.has_home_slack()) out.home_slack = check->In(limits::kHomeSlack, path / "home_slack", spec.home_slack());
   if (spec.has_dwell()) out.dwell = static_cast<int>(check->Whole(path / "dwell", spec.dwell(), 0, limits::kMaxDwell));
-  if (out.k > 0 && (spec.has_return_gap() || spec.has_dwell())) {
-    check->Fail(path / (spec.has_return_gap() ? "return_gap" : "dwell"),
+  if (out.k > 0 && (spec.has_return_gap() || spec.has_home_slack() || spec.has_dwell())) {
+    check->Fail(path / (spec.has_return_gap()   ? "return_gap"
+                        : spec.has_home_slack() ? "home_slack"
+                                                : "dwell"),
                 "has no meaning with a delay of 1 or more, whose margins follow from the tolerances; leave it out");
   }
   return out;
