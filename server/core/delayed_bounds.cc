@@ -1,6 +1,7 @@
 // How far bodies may get within the horizon: by the speed tolerance, or by their energy (R12).
 #include <algorithm>
 #include <map>
+#include <tuple>
 
 #include "server/core/check.h"
 #include "server/core/delayed_exchange.h"
@@ -23,7 +24,7 @@ void DelayedExchange::AnnounceKicks() {
 }
 
 void DelayedExchange::SetBounds() {
-  same_ = {margins_.predict * step_ / 2, margins_.give_back * step_ / 2, 0, 0};
+  same_ = {margins_.predict * step_ / 2, margins_.give_back * step_ / 2, 0, {}};
   most_push_ = same_.push;
   most_give_ = same_.give;
   for (Node& f : foreign_) {
@@ -64,24 +65,57 @@ double DelayedExchange::KickEnergy(BodyId id, const BodyView& v) const {
   return energy;
 }
 
-void DelayedExchange::ComputeReach() {
-  const Environment& e = h_.world.environment;
-  const ReachLimits limits{h_.world.tolerances.speed, h_.world.exchange.recovery, e.gravity.norm(), e.dt()};
-  std::vector<ReachNode> nodes;
-  std::vector<double> energies;
-  std::map<std::pair<RegionId, BodyId>, int> groups;
+// What is foreign, with the energies of its groups, in the states that are known of it.
+void DelayedExchange::ForeignReach(std::vector<ReachNode>* nodes, Energies* energies) const {
+  std::map<std::tuple<int, RegionId, BodyId>, int> groups;
   for (const Node& f : foreign_) {
     ReachNode n;
     n.id = f.id;
     n.box = f.box;
-    const Aura aura = AuraOf(f.id);
-    n.mass = std::max(1e-9, static_cast<double>(aura.mass));
-    auto [it, fresh] = groups.emplace(std::pair{f.owner, aura.group}, static_cast<int>(energies.size()));
-    if (fresh) energies.push_back(0);
-    energies[it->second] = std::max(energies[it->second], static_cast<double>(aura.energy));
+    n.source = f.source;
+    BodyId group = 0;
+    if (f.source == 0) {
+      const Shadow& s = shadows_.at(f.id);
+      n.mass = s.states.front().view.mass;
+      group = s.bound.group;
+    } else {
+      const Aura& a = remote_.at(h_.peers[static_cast<size_t>(f.source - 1)]).at(f.id);
+      n.mass = std::max(1e-9, static_cast<double>(a.mass));
+      group = a.group;
+    }
+    auto [it, fresh] = groups.emplace(std::tuple{f.source, f.owner, group}, 0);
+    if (fresh) it->second = energies->Add();
     n.group = it->second;
-    nodes.push_back(n);
+    const auto raise = [&](int source, double joules) {
+      energies->At(n.group, source) = std::max(energies->At(n.group, source), joules);
+    };
+    if (f.source == 0) {
+      const Shadow& s = shadows_.at(f.id);
+      for (size_t i = 0; i < s.bound.energies.size(); ++i) raise(static_cast<int>(i), s.bound.energies[i]);
+      raise(0, s.states.front().view.energy);
+    } else {
+      const Aura& a = remote_.at(h_.peers[static_cast<size_t>(f.source - 1)]).at(f.id);
+      raise(f.source, a.energy);
+    }
+    nodes->push_back(n);
   }
+}
+
+ReachNode DelayedExchange::OwnReach(BodyId id, Energies* energies) const {
+  const BodyView v = OwnView(id);
+  const int group = energies->Add();
+  energies->At(group, 0) = KickEnergy(id, v);
+  // What pushes bodies apart ends when they are apart: it adds to a speed once, not in every tick.
+  const double push = h_.world.exchange.recovery / h_.world.environment.dt();
+  return {id, SphereBox(v), v.mass, group, 0, 0, push};
+}
+
+void DelayedExchange::ComputeReach() {
+  const Environment& e = h_.world.environment;
+  const ReachLimits limits{h_.world.tolerances.speed, h_.world.exchange.recovery, e.gravity.norm(), e.dt()};
+  std::vector<ReachNode> nodes;
+  Energies energies(1 + static_cast<int>(h_.peers.size()));
+  ForeignReach(&nodes, &energies);
   PropagateReach(nodes, &energies, {}, k_, limits);
   const size_t foreign = nodes.size();
   absl::flat_hash_map<BodyId, int> index;
@@ -89,10 +123,8 @@ void DelayedExchange::ComputeReach() {
   for (const auto& [id, bound] : bounds_) ids.push_back(id);
   std::sort(ids.begin(), ids.end());
   for (BodyId id : ids) {
-    const BodyView v = OwnView(id);
     index[id] = static_cast<int>(nodes.size());
-    nodes.push_back({id, SphereBox(v), v.mass, static_cast<int>(energies.size()), 0});
-    energies.push_back(KickEnergy(id, v));
+    nodes.push_back(OwnReach(id, &energies));
   }
   std::vector<std::pair<int, int>> joined;
   std::vector<BodyId> partners;
@@ -110,26 +142,22 @@ void DelayedExchange::ComputeReach() {
     if (i >= foreign) most_push_ = std::max(most_push_, nodes[i].distance);
   }
   PropagateReach(nodes, &energies, joined, 2 * k_, limits);
-  std::vector<BodyId> name(energies.size(), 0);
+  std::vector<BodyId> name(static_cast<size_t>(energies.groups()), 0);
   for (size_t i = 0; i < nodes.size(); ++i) {
-    (i < foreign ? foreign_[i].give : bounds_[nodes[i].id].give) = nodes[i].distance;
-    if (i < foreign) continue;
-    most_give_ = std::max(most_give_, nodes[i].distance);
-    if (name[nodes[i].group] == 0) name[nodes[i].group] = nodes[i].id;
-    bounds_[nodes[i].id].group = name[nodes[i].group];
-    bounds_[nodes[i].id].energy = energies[nodes[i].group];
+    const ReachNode& n = nodes[i];
+    if (i < foreign) {
+      foreign_[i].give = n.distance;
+      continue;
+    }
+    Bound& bound = bounds_[n.id];
+    bound.give = n.distance;
+    most_give_ = std::max(most_give_, n.distance);
+    BodyId& group = name[static_cast<size_t>(n.group)];
+    if (group == 0) group = n.id;
+    bound.group = group;
+    const std::span<const double> parts = energies.Of(n.group);
+    bound.energies.assign(parts.begin(), parts.end());
   }
-}
-
-Aura DelayedExchange::AuraOf(BodyId id) const {
-  if (auto s = shadows_.find(id); s != shadows_.end()) {
-    const auto& states = s->second.states;
-    return MakeAura(id, states[std::min<size_t>(h_.tick - s->second.sent, states.size() - 1)].view, s->second.owner);
-  }
-  for (const auto& [peer, auras] : remote_) {
-    if (auto a = auras.find(id); a != auras.end()) return a->second;
-  }
-  AUREOLE_CHECK(false, "no aura of body %llu", static_cast<unsigned long long>(id));
 }
 
 DelayedExchange::Bound DelayedExchange::BoundOf(BodyId id, bool* grown) {

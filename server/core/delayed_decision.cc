@@ -25,7 +25,8 @@ void DelayedExchange::FindForeign() {
   }
   for (RegionId peer : h_.peers) {
     for (const auto& [id, a] : remote_[peer]) {
-      if (!h_.held.contains(id) && !shadows_.contains(id)) foreign_.push_back({id, a.owner, Widen(a.box), false});
+      if (h_.held.contains(id) || shadows_.contains(id)) continue;
+      foreign_.push_back({id, a.owner, Widen(a.box), false, 0, 0, SourceOf(peer)});
     }
   }
   std::sort(foreign_.begin(), foreign_.end(), [](const Node& x, const Node& y) {

@@ -17,6 +17,7 @@
 #include <absl/container/flat_hash_map.h>
 
 #include "server/core/holdings.h"
+#include "server/core/reach.h"
 #include "server/core/union_find.h"
 
 namespace aureole {
@@ -51,7 +52,7 @@ class DelayedExchange final : public Protocol {
   struct Bound {
     double push = 0, give = 0;  // m, as in Node
     BodyId group = 0;
-    double energy = 0;  // of the group, J
+    std::vector<double> energies;  // of the group, J: of own bodies, then as each peer tells
   };
 
   // What the sender of a cluster knows of one of its bodies while it is in flight: states sent .. sent+k-1.
@@ -78,6 +79,7 @@ class DelayedExchange final : public Protocol {
     Box box;
     bool own;
     double push = 0, give = 0;  // an edge when the gap is at most the sum of both: for AC, and for BT
+    int source = 0;             // 1 + index of the peer that tells of it; 0: this region knows it itself
   };
 
   Tick now() const { return h_.tick + 1; }
@@ -120,14 +122,16 @@ class DelayedExchange final : public Protocol {
   // How far everything reaches. `tolerance`: as far as the speed tolerance allows, everything alike.
   void SetBounds();
 
+  ReachNode OwnReach(BodyId id, Energies* energies) const;
   double KickEnergy(BodyId id, const BodyView& v) const;
 
   // R12. Foreign states are k ticks old: they move alone until now, then everything together; H - k ticks on is what AC
   // looks at, H + k what BT looks at and what an aura says.
   void ComputeReach();
+  void ForeignReach(std::vector<ReachNode>* nodes, Energies* energies) const;
 
-  // What is known of a foreign body's bound.
-  Aura AuraOf(BodyId id) const;
+  // Where the peer's part of a bound's energies is.
+  int SourceOf(RegionId peer) const { return 1 + (peer > h_.self ? peer - 1 : peer); }
 
   // The bound of an own body. `grown` is set when it had none: then all must be computed again, with it.
   Bound BoundOf(BodyId id, bool* grown);
@@ -161,7 +165,8 @@ class DelayedExchange final : public Protocol {
 
   using Auras = std::map<BodyId, Aura>;
 
-  Aura MakeAura(BodyId id, const BodyView& v, RegionId owner) const;
+  // What `peer` gets to know of the body.
+  Aura MakeAura(BodyId id, const BodyView& v, RegionId owner, RegionId peer) const;
 
   // The paper's BNU (Algorithm 6). R9: whom to tell is computed afresh as a set each tick; OBC, OBU and OBE (Algorithms
   // 3 to 5) are its differences from the set before.

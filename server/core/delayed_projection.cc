@@ -1,4 +1,5 @@
 // What peers are told: BNU, OBC, OBU and OBE, the paper's Algorithms 3 to 6, by rule R9.
+#include <algorithm>
 #include <cmath>
 #include <limits>
 
@@ -13,21 +14,26 @@ void DelayedExchange::CountHomes() {
   h_.stats.aura_tests += static_cast<int64_t>(near_.size());
 }
 
-Aura DelayedExchange::MakeAura(BodyId id, const BodyView& v, RegionId owner) const {
+Aura DelayedExchange::MakeAura(BodyId id, const BodyView& v, RegionId owner, RegionId peer) const {
   Aura a;
   a.id = id;
   a.box = RoundOutward(SphereBox(v));
   a.owner = owner;
   if (!reach_) return a;
-  a.group = id;
-  double energy = v.energy;
+  const Bound* bound = nullptr;
   if (auto s = shadows_.find(id); s != shadows_.end()) {
-    a.group = s->second.bound.group;
-    energy = std::max(energy, s->second.bound.energy);
+    bound = &s->second.bound;
   } else if (auto b = bounds_.find(id); b != bounds_.end()) {
-    a.group = b->second.group;
-    energy = b->second.energy;
+    bound = &b->second;
   }
+  a.group = bound != nullptr && bound->group != 0 ? bound->group : id;
+  double energy = 0;
+  if (bound != nullptr) {
+    for (size_t i = 0; i < bound->energies.size(); ++i) {
+      if (static_cast<int>(i) != SourceOf(peer)) energy += bound->energies[i];
+    }
+  }
+  energy = std::max(energy, v.energy);
   a.energy = std::nextafter(static_cast<float>(energy), std::numeric_limits<float>::infinity());
   if (energy == 0) a.energy = 0;
   a.mass = std::nextafter(static_cast<float>(v.mass), 0.0f);
@@ -74,11 +80,11 @@ void DelayedExchange::Project(std::map<RegionId, Auras>* next, std::map<BodyId, 
       hits.clear();
       OwnNear(box, reach, &hits);
       Auras& told = (*next)[a.owner];
-      for (BodyId id : hits) told.try_emplace(id, MakeAura(id, OwnView(id), h_.self));
+      for (BodyId id : hits) told.try_emplace(id, MakeAura(id, OwnView(id), h_.self, a.owner));
       for (const auto& [id, s] : shadows_) {
         if (h_.tick - s.sent >= k_) continue;
         const BodyView& v = s.states[h_.tick - s.sent].view;
-        if (Gap(SphereBox(v), box) <= reach) told.try_emplace(id, MakeAura(id, v, s.owner));
+        if (Gap(SphereBox(v), box) <= reach) told.try_emplace(id, MakeAura(id, v, s.owner, a.owner));
       }
     }
   }
@@ -89,7 +95,7 @@ void DelayedExchange::ProjectToRegions(BodyId id, const BodyView& v, RegionId ow
   const Box box = SphereBox(v);
   const double reach = ProjectReach();
   for (RegionId peer : h_.peers) {
-    if (h_.world.layout.rect(peer).Gap(box) <= reach) (*next)[peer].emplace(id, MakeAura(id, v, owner));
+    if (h_.world.layout.rect(peer).Gap(box) <= reach) (*next)[peer].emplace(id, MakeAura(id, v, owner, peer));
   }
   if (!h_.world.layout.rect(owner).Encloses(box, 0)) (*away)[id] = {id, owner, RoundOutward(box)};
 }

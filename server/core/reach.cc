@@ -31,30 +31,40 @@ void PoolNear(std::span<const ReachNode> nodes, std::vector<int>* order, UnionFi
 
 }  // namespace
 
-void PropagateReach(std::span<ReachNode> nodes, std::vector<double>* energies,
-                    std::span<const std::pair<int, int>> joined, int ticks, const ReachLimits& limits) {
-  // A body at rest in the field, or pushed out by the solver, gains this much speed in a tick.
-  const double gain = limits.gravity * limits.dt + limits.recovery / limits.dt;
+double Energies::Sum(int group) const {
+  double sum = 0;
+  for (double part : Of(group)) sum += part;
+  return sum;
+}
+
+void PropagateReach(std::span<ReachNode> nodes, Energies* energies, std::span<const std::pair<int, int>> joined,
+                    int ticks, const ReachLimits& limits) {
   std::vector<int> order;
   for (int tick = 0; tick < ticks; ++tick) {
-    UnionFind groups(static_cast<int>(energies->size()));
+    UnionFind groups(energies->groups());
     PoolNear(nodes, &order, &groups);
     for (auto [a, b] : joined) groups.Unite(nodes[a].group, nodes[b].group);
-    std::vector<double> pooled(energies->size(), 0.0);
-    for (int g = 0; g < groups.size(); ++g) pooled[groups.Find(g)] += (*energies)[g];
-    // What sleeps alone stays: nothing gains speed in a group without energy.
-    std::vector<double> gained(energies->size(), 0.0);
+    Energies pooled(energies->sources());
+    for (int g = 0; g < groups.size(); ++g) pooled.Add();
+    for (int g = 0; g < groups.size(); ++g) {
+      for (int s = 0; s < energies->sources(); ++s) pooled.At(groups.Find(g), s) += energies->At(g, s);
+    }
+    std::vector<double> sums;
+    for (int g = 0; g < groups.size(); ++g) sums.push_back(pooled.Sum(g));
     for (ReachNode& n : nodes) {
       n.group = groups.Find(n.group);
-      if (pooled[n.group] <= 0) continue;
-      const double speed = std::sqrt(2 * pooled[n.group] / n.mass);
-      const double next = std::min(limits.speed, speed + gain);
+      const double energy = sums[n.group];
+      if (energy <= 0) continue;  // what sleeps alone stays: nothing gains speed in a group without energy
+      const double speed = std::sqrt(2 * energy / n.mass);
+      const double next = std::min(limits.speed, speed + limits.gravity * limits.dt + n.push);
+      n.push = 0;
       // E grows by the work on this body: m v dv + m dv^2 / 2.
       const double dv = std::max(0.0, next - speed);
-      gained[n.group] += n.mass * dv * (speed + dv / 2);
+      double& part = pooled.At(n.group, n.source);
+      part = std::min(part + n.mass * dv * (speed + dv / 2), kMostEnergy);
       n.distance += next * limits.dt + limits.recovery;
     }
-    for (size_t g = 0; g < pooled.size(); ++g) (*energies)[g] = std::min(pooled[g] + gained[g], kMostEnergy);
+    *energies = std::move(pooled);
   }
 }
 

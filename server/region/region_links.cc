@@ -92,6 +92,7 @@ LinkStats RegionLinks::Totals() const {
     const LinkStats s = link->stats();
     sum.frames_sent += s.frames_sent;
     sum.frames_received += s.frames_received;
+    sum.frames_kept += s.frames_kept;
     sum.bytes_sent += s.bytes_sent;
     sum.connections += s.connections;
     sum.reconnects += s.reconnects;

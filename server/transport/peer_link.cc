@@ -141,7 +141,9 @@ void PeerLink::Close() {
 
 LinkStats PeerLink::stats() const {
   const std::lock_guard lock(mutex_);
-  return stats_;
+  LinkStats out = stats_;
+  out.frames_kept = static_cast<int64_t>(sender_.kept());
+  return out;
 }
 
 v1::LinkHello PeerLink::Hello() const {

@@ -49,6 +49,7 @@ using EncodedFrame = std::shared_ptr<const std::string>;
 struct LinkStats {
   int64_t frames_sent = 0;      // written, frames repeated after a reconnect included
   int64_t frames_received = 0;  // applied
+  int64_t frames_kept = 0;      // now, until they are acknowledged
   int64_t bytes_sent = 0;       // of messages: payload, without gRPC's framing
   int64_t connections = 0;      // that passed the handshake
   int64_t reconnects = 0;       // of these, all but the first

@@ -155,6 +155,18 @@ TEST(PeerLink, EmptyBorderCostsAtMostThirtyTwoBytesPerTick) {
   EXPECT_EQ(high.frames().back().tick, kFirst + kTicks - 1);
 }
 
+TEST(PeerLink, OneWayTrafficIsAcknowledgedAlone) {
+  End low(0, 1), high(1, 0);
+  low.link().Dial(high.endpoint());
+  for (Tick n = 1; n <= 1000; ++n) {
+    low.Send(EmptyFrame(n));
+    ASSERT_TRUE(high.Await(static_cast<size_t>(n)));
+  }
+  for (int i = 0; i < 1000 && low.link().stats().frames_kept > 64; ++i)
+    std::this_thread::sleep_for(std::chrono::milliseconds(10));
+  EXPECT_LE(low.link().stats().frames_kept, 64);
+}
+
 TEST(PeerLink, FramesSentBeforeTheConnectionArrive) {
   End low(0, 1), high(1, 0);
   for (Tick n = 1; n <= 10; ++n) low.Send(EmptyFrame(n));

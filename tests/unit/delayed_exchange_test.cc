@@ -1,4 +1,5 @@
 // What the fixed-delay exchange (k >= 1) tells and decides, in small worlds.
+#include <algorithm>
 #include <array>
 #include <limits>
 
@@ -83,6 +84,64 @@ TEST_P(DelayedExchange, SleeperIsCoHostedBeforeAFastBodyReachesIt) {
     }
     EXPECT_FALSE(whole.engine().View(2).asleep) << "it must have been struck";
   }
+}
+
+// Joules that region `from` told region `to` of the body in the last tick; negative when it said nothing new of it.
+double EnergyTold(const Lockstep& split, RegionId from, RegionId to, BodyId id) {
+  for (const Frame& f : split.LastFrames()) {
+    if (f.from != from || f.to != std::vector<RegionId>{to}) continue;
+    for (const Aura& a : f.auras) {
+      if (a.id == id) return a.energy;
+    }
+  }
+  return -1;
+}
+
+double KineticEnergy(Lockstep& split, BodyId id) {
+  const BodyView v = split.region(split.Owner(id)).engine().View(id);
+  return 0.5 * v.mass * v.velocity.squaredNorm();
+}
+
+// R12: what a region was told by another does not come back to that other, or it would double in every exchange.
+TEST_P(DelayedExchange, ReachTellsNobodyHisOwnEnergy) {
+  World w = WeightlessWorld(*Layout::Columns(std::array{0.0}), GetParam());
+  w.exchange.policy = AuraPolicy::kReach;
+  // Along the border, drawing nearer.
+  w.bodies = {Ball(1, {-7, 0, 0}, 3), Ball(2, {7, 0, 0}, -3)};
+  w.bodies[0].velocity.z() = w.bodies[1].velocity.z() = 9.5;
+  Lockstep split(w);
+  ASSERT_NE(split.Owner(1), split.Owner(2));
+  const double energy = KineticEnergy(split, 1);
+  ASSERT_EQ(energy, KineticEnergy(split, 2));
+  Tick n = 1;
+  for (; n <= 160 && split.Owner(1) == 0 && split.Owner(2) == 1; ++n) {
+    EXPECT_LE(EnergyTold(split, 0, 1, 1), 1.001 * energy) << "tick " << n;
+    EXPECT_LE(EnergyTold(split, 1, 0, 2), 1.001 * energy) << "tick " << n;
+    split.RunTo(n);
+  }
+  EXPECT_LE(n, 160) << "they must have come within reach";
+}
+
+// R12: a region that sees only the near end of a row is told what may strike its far end.
+TEST_P(DelayedExchange, ReachTellsOfTheEnergyOfThirdRegions) {
+  World w = WeightlessWorld(*Layout::Columns(std::array{0.0, 3.0}), GetParam());
+  w.exchange.policy = AuraPolicy::kReach;
+  for (BodyId id = 1; id <= 4; ++id) {
+    w.bodies.push_back(Ball(id, {0.5 + 0.59 * static_cast<double>(id - 1), 0, 0}));
+    w.bodies.back().asleep = true;
+  }
+  w.bodies.push_back(Ball(5, {25, 0, 0}, -20));
+  Lockstep split(w);
+  ASSERT_EQ(split.Owner(1), 1);
+  ASSERT_EQ(split.Owner(5), 2);
+  const double energy = KineticEnergy(split, 5);
+  double told = 0;
+  for (Tick n = 1; n <= 100 && split.Owner(5) == 2; ++n) {
+    split.RunTo(n);
+    told = std::max(told, EnergyTold(split, 1, 0, 1));
+  }
+  EXPECT_EQ(split.Owner(1), 1);
+  EXPECT_GE(told, energy);
 }
 
 INSTANTIATE_TEST_SUITE_P(EveryDelay, DelayedExchange, testing::Values(1, 2, 3),
