@@ -6,6 +6,7 @@
 #include <absl/strings/str_format.h>
 #include <nlohmann/json.hpp>
 
+#include "client/cli/slack_json.h"
 namespace aureole {
 namespace {
 
@@ -58,7 +59,7 @@ Json RowJson(const Row& row, const Experiment& experiment) {
               {"violations", m.violations},
               {"transfers", m.transfers},
               {"touching_transfers", m.touching_transfers},
-              {"slack_at_first_touch", nullptr},  // not measured
+              {"slack_at_first_touch", SlackJson(m)},
               {"largest_cluster", m.largest_cluster},
               {"largest_component", m.largest_component},
               {"longest_chain", m.longest_chain},

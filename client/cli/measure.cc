@@ -1,7 +1,9 @@
 #include "client/cli/measure.h"
 
 #include <algorithm>
+#include <cmath>
 #include <map>
+#include <numeric>
 
 namespace aureole {
 namespace {
@@ -50,6 +52,27 @@ std::optional<double> RunMeasure::TransfersPerHomeCrossing() const {
   return static_cast<double>(bodies_moved) / static_cast<double>(home_crossings);
 }
 
+std::optional<SlackQuantiles> QuantilesOf(const std::vector<int64_t>& slack) {
+  if (slack.empty()) return std::nullopt;
+  SlackQuantiles out;
+  out.never = slack.back();
+  out.met = std::accumulate(slack.begin(), slack.end() - 1, int64_t{0});
+  if (out.met == 0) return std::nullopt;
+  // The smallest slack that at least this share of the bodies did not exceed.
+  const auto quantile = [&](double share) {
+    const auto rank = std::max<int64_t>(1, static_cast<int64_t>(std::ceil(share * static_cast<double>(out.met))));
+    int64_t sum = 0;
+    for (size_t i = 0;; ++i) {
+      if ((sum += slack[i]) >= rank) return static_cast<int>(i);
+    }
+  };
+  out.min = quantile(0);
+  out.p1 = quantile(0.01);
+  out.p50 = quantile(0.5);
+  out.p99 = quantile(0.99);
+  return out;
+}
+
 RunMeasure Measure(const RunResult& result, int64_t tick_us) {
   RunMeasure out;
   out.hashes = result.hashes;
@@ -91,6 +114,8 @@ RunMeasure Measure(const RunResult& result, int64_t tick_us) {
     out.largest_cluster = std::max(out.largest_cluster, report.largest_cluster());
     out.largest_component = std::max(out.largest_component, report.largest_component());
     out.longest_chain = std::max(out.longest_chain, report.longest_chain());
+    out.slack.resize(std::max<size_t>(out.slack.size(), report.slack_size()));
+    for (int i = 0; i < report.slack_size(); ++i) out.slack[i] += report.slack(i);
     out.away_body_ticks += report.away_body_ticks();
     out.body_ticks += report.body_ticks();
     out.bytes_sent += report.bytes_sent();

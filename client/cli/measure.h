@@ -41,6 +41,7 @@ struct RunMeasure {
   int64_t violations = 0;
   int64_t transfers = 0, touching_transfers = 0, bodies_moved = 0, home_crossings = 0;
   int64_t largest_cluster = 0, largest_component = 0, longest_chain = 0;
+  std::vector<int64_t> slack;  // v1::Report.slack, of all regions
   int64_t away_body_ticks = 0, body_ticks = 0;
   int64_t bytes_sent = 0, waits = 0, wait_us = 0;
   double wall_seconds = 0;
@@ -51,6 +52,14 @@ struct RunMeasure {
   // Ownership moves of bodies for each time that a body crossed a border of homes; nothing when none crossed.
   std::optional<double> TransfersPerHomeCrossing() const;
 };
+
+// Ticks from the arrival of a body that came to be with others to its first touch of one of them.
+struct SlackQuantiles {
+  int64_t met = 0, never = 0;  // bodies that did, and that did not within the ticks that are watched
+  int min = 0, p1 = 0, p50 = 0, p99 = 0;
+};
+// Nothing when no body met another.
+std::optional<SlackQuantiles> QuantilesOf(const std::vector<int64_t>& slack);
 
 RunMeasure Measure(const RunResult& result, int64_t tick_us);
 

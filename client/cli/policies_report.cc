@@ -6,6 +6,7 @@
 #include <absl/strings/str_format.h>
 #include <nlohmann/json.hpp>
 
+#include "client/cli/slack_json.h"
 namespace aureole {
 namespace {
 
@@ -44,19 +45,24 @@ std::string BarText(const PolicyFigures& f, const std::optional<PolicyBar>& bar)
                          MovesMet(f, *bar) ? "PASS" : "miss");
 }
 
+std::string SlackText(const RunMeasure& m) {
+  const std::optional<SlackQuantiles> q = QuantilesOf(m.slack);
+  return q ? absl::StrCat(q->min, "/", q->p50) : "-";
+}
+
 void AddScene(const PolicyScene& scene, std::string* out, std::string* notes) {
   absl::StrAppendFormat(out, "%s: %d bodies; one server: mean %.2f ms, max %.2f ms\n", SceneName(scene),
                         scene.reference.bodies, MeanMs(scene.reference), MaxMs(scene.reference));
-  absl::StrAppendFormat(out, "%-16s %5s %6s %6s %6s %6s %9s %9s %8s %8s %7s %7s %9s %10s  %s\n", "exchange", "equal",
-                        "away", "most", "comp", "sent", "moved", "per cross", "mean ms", "max ms", "of one", "waits",
-                        "wait ms", "bytes", "aims");
+  absl::StrAppendFormat(out, "%-16s %5s %6s %6s %6s %6s %9s %9s %8s %8s %7s %7s %9s %10s %7s  %s\n", "exchange",
+                        "equal", "away", "most", "comp", "sent", "moved", "per cross", "mean ms", "max ms", "of one",
+                        "waits", "wait ms", "bytes", "slack", "aims");
   for (const PolicyRun& run : scene.runs) {
     const PolicyFigures f = FiguresOf(run, scene);
     const RunMeasure& m = run.measure;
-    absl::StrAppendFormat(out, "%-16s %5s %6.4f %6.3f %6d %6d %9d %9s %8.2f %8.2f %7.3f %7.2f %9.3f %10.0f  %s\n",
+    absl::StrAppendFormat(out, "%-16s %5s %6.4f %6.3f %6d %6d %9d %9s %8.2f %8.2f %7.3f %7.2f %9.3f %10.0f %7s  %s\n",
                           run.exchange.Name(), run.comparison.hash_equal ? "yes" : "NO", f.away, f.most_hosted,
                           m.largest_component, m.largest_cluster, m.bodies_moved, OrDash(f.moves, 2), f.mean_ms,
-                          f.max_ms, f.of_one, f.waits, f.wait_ms, f.bytes,
+                          f.max_ms, f.of_one, f.waits, f.wait_ms, f.bytes, SlackText(m),
                           BarText(f, BarOf(run.exchange, scene.density)));
     if (run.Exact()) continue;
     absl::StrAppendFormat(notes, "%s, %s: NOT EXACT: ", SceneName(scene), run.exchange.Name());
@@ -75,7 +81,9 @@ constexpr char kLegend[] =
     "bodies of the largest component that several owners had a part in; 0: none had. sent: bodies of the largest\n"
     "transfer. moved: bodies, in all transfers; per cross: for each crossing of the border. mean, max: frame time of\n"
     "the busiest server, CPU outside of waits; of one: its mean over the undivided one. waits, wait ms: per tick and\n"
-    "server, on this machine, without a wall clock to wait for. bytes: payload per tick, link and direction.\n";
+    "server, on this machine, without a wall clock to wait for. bytes: payload per tick, link and direction. slack: "
+    "ticks from\n"
+    "a body's arrival at others to its first touch of one, least and median.\n";
 
 Json RunJson(const PolicyRun& run, const PolicyScene& scene) {
   const PolicyFigures f = FiguresOf(run, scene);
@@ -103,7 +111,7 @@ Json RunJson(const PolicyRun& run, const PolicyScene& scene) {
               {"waits_per_tick", f.waits},
               {"wait_ms_per_tick", f.wait_ms},
               {"bytes_per_tick_and_link", f.bytes},
-              {"slack_at_first_touch", nullptr},  // not measured
+              {"slack_at_first_touch", SlackJson(m)},
               {"wall_s", m.wall_seconds},
               {"aims", nullptr}};
   if (run.exchange.k > 0) out["policy"] = run.exchange.reach ? "reach" : "tolerance";
@@ -236,17 +244,19 @@ std::string ToCsv(const PolicyTable& table) {
   std::string csv =
       "world,density,kicks,policy,k,hash_equal,violations,away,most_hosted,largest_component,largest_cluster,"
       "bodies_moved,home_crossings,mean_frame_ms,max_frame_ms,of_one,waits_per_tick,wait_ms_per_tick,"
-      "bytes_per_tick_and_link\n";
+      "bytes_per_tick_and_link,slack_min,slack_p50\n";
   for (const PolicyScene& scene : table.scenes) {
     for (const PolicyRun& run : scene.runs) {
       const PolicyFigures f = FiguresOf(run, scene);
       const RunMeasure& m = run.measure;
+      const std::optional<SlackQuantiles> slack = QuantilesOf(m.slack);
       const char* policy = run.exchange.k == 0 ? "" : run.exchange.reach ? "reach" : "tolerance";
-      absl::StrAppendFormat(&csv, "%s,%g,%s,%s,%d,%d,%d,%.6f,%.4f,%d,%d,%d,%d,%.4f,%.4f,%.4f,%.4f,%.4f,%.1f\n",
+      absl::StrAppendFormat(&csv, "%s,%g,%s,%s,%d,%d,%d,%.6f,%.4f,%d,%d,%d,%d,%.4f,%.4f,%.4f,%.4f,%.4f,%.1f,%s,%s\n",
                             scene.world, scene.density, scene.fast ? "fast" : "slow", policy, run.exchange.k,
                             run.comparison.hash_equal ? 1 : 0, m.violations, f.away, f.most_hosted, m.largest_component,
                             m.largest_cluster, m.bodies_moved, m.home_crossings, f.mean_ms, f.max_ms, f.of_one, f.waits,
-                            f.wait_ms, f.bytes);
+                            f.wait_ms, f.bytes, slack ? absl::StrCat(slack->min) : "",
+                            slack ? absl::StrCat(slack->p50) : "");
     }
   }
   return csv;

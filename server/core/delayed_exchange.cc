@@ -48,6 +48,7 @@ void DelayedExchange::Advance(std::vector<Frame>* out) {
     phase_ = Phase::kStep;
     return;
   }
+  h_.MeasureSlack(now());
   h_.engine->Step(now());
   ++h_.tick;
   AnnounceSpawns();

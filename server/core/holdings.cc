@@ -202,21 +202,39 @@ void Holdings::Arrive(const Transfer& t, RegionId from, Tick n) {
                   static_cast<unsigned long long>(t.ids[0]), from, self, static_cast<long long>(n),
                   std::string(s.message()).c_str());
   }
+  const int64_t transfer = ++stats.transfers_in;
   for (size_t i = 0; i < t.ids.size(); ++i) {
-    const bool fresh = held.emplace(t.ids[i], Held{t.epochs[i], n}).second;
+    const bool fresh = held.emplace(t.ids[i], Held{t.epochs[i], n, transfer}).second;
     AUREOLE_CHECK(fresh, "body %llu came from region %d but region %d owns it",
                   static_cast<unsigned long long>(t.ids[i]), from, self);
     sent_to.erase(t.ids[i]);
+    if (t.cause == TransferCause::kAuraCollision) newcomers_.emplace_back(t.ids[i], transfer);
   }
   pending.insert(pending.end(), t.pending.begin(), t.pending.end());
   std::sort(pending.begin(), pending.end());
-  ++stats.transfers_in;
   stats.bodies_in += static_cast<int64_t>(t.ids.size());
 }
 
 void Holdings::Report(const Violation& v) {
   ++stats.violations;
   if (violations.size() < kMaxViolations) violations.push_back(v);
+}
+
+void Holdings::MeasureSlack(Tick n) {
+  std::erase_if(newcomers_, [&](const std::pair<BodyId, int64_t>& newcomer) {
+    const auto& [id, transfer] = newcomer;
+    const auto it = held.find(id);
+    if (it == held.end() || it->second.transfer != transfer) return true;  // removed, or on its way again
+    if (!engine->Contains(id)) return false;                               // a spawn to come
+    const Tick slack = n - it->second.arrived;
+    touched_.clear();
+    engine->Query(engine->View(id).box, &touched_);
+    const bool met = std::any_of(touched_.begin(), touched_.end(),
+                                 [&](BodyId other) { return other != id && held.at(other).transfer != transfer; });
+    if (!met && slack < kSlackTicks) return false;
+    ++stats.slack[static_cast<size_t>(met ? slack : kSlackTicks)];
+    return true;
+  });
 }
 
 void Holdings::CountHomes(std::span<const BodyId> near) {

@@ -22,6 +22,7 @@ namespace aureole {
 struct Held {
   Epoch epoch = 0;
   Tick arrived = -1000000;  // tick at which it was transferred here; long ago for what began here
+  int64_t transfer = 0;     // with which it came: the count of transfers here; 0: it began here
 };
 
 // Frames of one peer that wait for their phase.
@@ -69,10 +70,15 @@ struct Holdings {
   // Takes over what a peer sent.
   void Arrive(const Transfer& transfer, RegionId from, Tick n);
   void Report(const Violation& v);
+  // Before the step of tick n: which newcomers now touch one that did not come with them.
+  void MeasureSlack(Tick n);
   // Home crossings and bodies away from home among `near` (ascending ids of the bodies that may be either).
   void CountHomes(std::span<const BodyId> near);
 
  private:
+  // Bodies that came to be with others and have met none yet, and with which transfer.
+  std::vector<std::pair<BodyId, int64_t>> newcomers_;
+  std::vector<BodyId> touched_;
   std::vector<std::pair<BodyId, RegionId>> homes_;  // of the bodies near the border, ascending
 };
 

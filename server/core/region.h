@@ -11,6 +11,7 @@
 // (PROTOCOL.md sections 4 and 10; the tick order is P22.)
 #pragma once
 
+#include <array>
 #include <cstdint>
 #include <memory>
 #include <string>
@@ -26,6 +27,8 @@
 namespace aureole {
 
 enum class Phase : uint8_t { kBegin, kGraph, kRelay, kDecide, kArrive, kStep };
+
+inline constexpr Tick kSlackTicks = 32;
 
 // Counters since the start. "Touching": the cluster had more than one body.
 struct RegionStats {
@@ -43,7 +46,10 @@ struct RegionStats {
   int64_t graphs_again = 0;           // k = 0: ticks in which somebody told a box late
   int64_t home_crossings = 0;
   int64_t away_bodies = 0;  // owned now, centre outside the home rectangle
-  int64_t violations = 0;   // broken horizons (I4), each also in Region::violations()
+  // Slack at first touch (PROTOCOL.md section 8): bodies that came here to be with others, by the ticks until the box
+  // of one first met one that had not come with it. [kSlackTicks]: none within so many ticks.
+  std::array<int64_t, kSlackTicks + 1> slack{};
+  int64_t violations = 0;  // broken horizons (I4), each also in Region::violations()
 };
 
 // A horizon that was broken: two bodies that were stepped apart although their exact boxes met.

@@ -63,6 +63,7 @@ class SyncExchange final : public Protocol {
       case Phase::kArrive:
         return TakeArrivals();
       case Phase::kStep:
+        h_.MeasureSlack(now());
         h_.engine->Step(now());
         ++h_.tick;
         phase_ = Phase::kBegin;

@@ -193,6 +193,9 @@ void TickLoop::Report(const std::vector<RegionId>& waiting_for, bool finished) {
   r.set_largest_component(stats.largest_component);
   r.set_longest_chain(stats.longest_chain);
   r.set_home_crossings(stats.home_crossings);
+  if (std::any_of(stats.slack.begin(), stats.slack.end(), [](int64_t n) { return n > 0; })) {
+    r.mutable_slack()->Assign(stats.slack.begin(), stats.slack.end());
+  }
   r.set_violations(stats.violations);
   r.set_away_bodies(stats.away_bodies);
   r.set_away_body_ticks(away_body_ticks_);

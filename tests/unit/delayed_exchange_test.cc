@@ -2,6 +2,7 @@
 #include <algorithm>
 #include <array>
 #include <limits>
+#include <numeric>
 
 #include <gtest/gtest.h>
 
@@ -83,6 +84,32 @@ TEST_P(DelayedExchange, SleeperIsCoHostedBeforeAFastBodyReachesIt) {
       ASSERT_EQ(split.Hash(), whole.Hash()) << "tick " << n << ", start " << i;
     }
     EXPECT_FALSE(whole.engine().View(2).asleep) << "it must have been struck";
+  }
+}
+
+// Two that run into each other are together some ticks before; that is the slack.
+TEST_P(DelayedExchange, SlackIsTheTimeFromArrivalToFirstTouch) {
+  World w = WeightlessWorld(*Layout::Columns(std::array{0.0}), GetParam());
+  w.bodies = {Ball(1, {-0.5, 0, 0}), Ball(2, {20, 0, 0}, -20), Ball(3, {-0.5, 0, 50}), Ball(4, {20, 0, 50}, -15)};
+  Lockstep split(w);
+  Undivided whole(split.world());
+  std::array<Tick, 2> arrived{}, touched{};
+  for (Tick n = 1; n <= 140; ++n) {
+    split.RunTo(n);
+    whole.RunTo(n);
+    ASSERT_EQ(split.Hash(), whole.Hash());
+    for (size_t i = 0; i < 2; ++i) {
+      const BodyId mover = 2 * i + 2;
+      if (arrived[i] == 0 && split.Owner(mover) == 0) arrived[i] = n;
+      if (touched[i] == 0 && whole.engine().View(mover).velocity.x() > -14) touched[i] = n;
+    }
+  }
+  const auto& slack = split.region(0).stats().slack;
+  EXPECT_EQ(std::accumulate(slack.begin(), slack.end(), int64_t{0}), 2);
+  for (size_t i = 0; i < 2; ++i) {
+    ASSERT_GT(arrived[i], 0);
+    ASSERT_GT(touched[i], arrived[i]);
+    EXPECT_GT(slack[static_cast<size_t>(std::min(kSlackTicks, touched[i] - arrived[i]))], 0);
   }
 }
 

@@ -43,6 +43,23 @@ TEST(ExperimentMeasure, WindowIsTheWorstServerOfEach) {
   EXPECT_EQ(m.regions[1].last_max_frame_ms, 6);
 }
 
+TEST(ExperimentMeasure, SlackIsCountedOverAllRegions) {
+  RunResult result;
+  result.status.regions.resize(3);
+  for (int n : {1, 0, 8, 0}) result.status.regions[0].report.add_slack(n);
+  for (int n : {0, 0, 90, 5}) result.status.regions[2].report.add_slack(n);
+  const std::optional<SlackQuantiles> q = QuantilesOf(Measure(result, 16000).slack);
+  ASSERT_TRUE(q.has_value());
+  EXPECT_EQ(q->met, 99);
+  EXPECT_EQ(q->never, 5);
+  EXPECT_EQ(q->min, 0);
+  EXPECT_EQ(q->p1, 0);
+  EXPECT_EQ(q->p50, 2);
+  EXPECT_EQ(q->p99, 2);
+  EXPECT_FALSE(QuantilesOf({}).has_value());
+  EXPECT_FALSE(QuantilesOf({0, 0, 7}).has_value()) << "none of them met anybody";
+}
+
 TEST(ExperimentMeasure, FramesOfARegionAreThoseOfTheWholeRun) {
   RunResult result;
   result.status.regions.resize(2);

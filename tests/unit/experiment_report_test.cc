@@ -83,7 +83,7 @@ TEST(ExperimentReport, JsonHasWhatTheRunsMeasured) {
   EXPECT_EQ(run["doubled"], 0);
   EXPECT_EQ(run["violations"], 0);
   EXPECT_EQ(run["transfers_per_home_crossing"], 1.5);
-  EXPECT_TRUE(run["slack_at_first_touch"].is_null()) << "nothing measures it";
+  EXPECT_TRUE(run["slack_at_first_touch"].is_null()) << "nobody met anybody";
   EXPECT_DOUBLE_EQ(run["ratio"], 0.3);
   EXPECT_EQ(run["windows"].size(), 2u);
   EXPECT_EQ(run["windows"][1]["t"], 10.0);
