@@ -160,15 +160,27 @@ class Run {
     }
   }
 
+  // I3: the epoch grows with every change of owner, and only then. A body in flight has its new owner's already.
+  bool EpochGrew(Tick n, const BodyRecord& r) {
+    auto [it, fresh] = owned_.emplace(r.id, std::pair{r.group, r.epoch});
+    auto& [owner, epoch] = it->second;
+    const bool landed = owner < 0 && r.group >= 0;
+    const bool moved = owner != r.group && !(landed && r.epoch == epoch);
+    if (!fresh && (moved ? r.epoch <= epoch : r.epoch != epoch)) {
+      Fail(n, "I3",
+           absl::StrCat("body ", r.id, " went from group ", owner, ", epoch ", epoch, ", to group ", r.group,
+                        ", epoch ", r.epoch));
+      return false;
+    }
+    it->second = {r.group, r.epoch};
+    return true;
+  }
+
   // I3 and I6 in state n.
   void CheckAfterStep(Tick n, Tally& t) {
     verdict_.hash = 0;
     for (const BodyRecord& r : t.records) {
-      auto [it, fresh] = epochs_.emplace(r.id, r.epoch);
-      if (r.epoch < it->second) {
-        return Fail(n, "I3", absl::StrCat("body ", r.id, " went from epoch ", it->second, " to ", r.epoch));
-      }
-      it->second = r.epoch;
+      if (!EpochGrew(n, r)) return;
       if (!reference_->Contains(r.id)) return Fail(n, "I2", absl::StrCat("body ", r.id, " should not be"));
       if (reference_->Hash(r.id) != r.hash) {
         return Fail(n, "I6", absl::StrCat("body ", r.id, " in group ", r.group, " differs from the undivided world"));
@@ -221,7 +233,7 @@ class Run {
   std::map<uint64_t, bool> taken_;
   std::map<BodyId, int64_t> groups_;
   std::map<BodyId, bool> asleep_;
-  std::map<BodyId, Epoch> epochs_;
+  std::map<BodyId, std::pair<int64_t, Epoch>> owned_;  // group and epoch when last seen
   Tick checked_ = 0;
   Verdict verdict_;
 };
