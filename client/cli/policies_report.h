@@ -61,7 +61,7 @@ struct PolicyFigures {
 };
 PolicyFigures FiguresOf(const PolicyRun& run, const PolicyScene& scene);
 
-// What we aim at (issue 2): bounds on `away` and `moves`, where we have any.
+// What we aim at: bounds on `away` and `moves`, where we have any.
 struct PolicyBar {
   double away = 0, moves = 0;
 };
