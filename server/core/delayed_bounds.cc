@@ -15,7 +15,7 @@ void DelayedExchange::AnnounceKicks() {
   if (announced_ == 0) announced_ = h_.tick;
   for (; announced_ < last; ++announced_) {
     std::vector<Input> inputs;
-    ScriptedInputs(h_.world, announced_ + 1, &inputs);
+    h_.AppendInputs(announced_ + 1, &inputs);
     for (const Input& i : inputs) {
       if (i.kind == Input::Kind::kImpulse || i.kind == Input::Kind::kVelocity) kicks_.emplace(i.body, i);
     }

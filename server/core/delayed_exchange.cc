@@ -79,22 +79,41 @@ Tick DelayedExchange::DueFrame() const {
 }
 
 void DelayedExchange::Begin() {
-  if (DueFrame() >= 0) {
+  if (const Tick due = DueFrame(); due >= 0) {
     for (RegionId peer : h_.peers) Apply(h_.inboxes.at(peer).Pop(), peer);
+    HearInputs(due);
   }
   std::vector<Input> inputs;
-  ScriptedInputs(h_.world, now(), &inputs);
+  h_.AppendInputs(now(), &inputs);
+  h_.live.ForgetBefore(now() + 1);
   // Scripted spawns have been announced; their owner holds them as pending.
   std::erase_if(inputs, [](const Input& i) { return i.kind == Input::Kind::kSpawn; });
-  h_.TakeDueInputs(now(), &inputs);
+  const auto due =
+      std::find_if(h_.pending.begin(), h_.pending.end(), [this](const Input& i) { return i.tick > now(); });
+  inputs.insert(inputs.end(), h_.pending.begin(), due);
+  h_.pending.erase(h_.pending.begin(), due);
   std::sort(inputs.begin(), inputs.end());
   for (const Input& i : inputs) {
     if (i.kind == Input::Kind::kSpawn) waiting_.erase(i.body);
-    if (i.kind == Input::Kind::kSpawn || h_.engine->Contains(i.body)) h_.ApplyInput(i);
+    h_.ApplyInput(i);
   }
 }
 
+void DelayedExchange::HearInputs(Tick n) {
+  std::vector<Graph> said = std::exchange(said_[n], {});
+  said_.erase(n);
+  std::sort(said.begin(), said.end(), [](const Graph& x, const Graph& y) { return x.of < y.of; });
+  for (const Graph& g : said) h_.live.Heard(g.applied);
+  // What took effect in tick n was said in its frame at the latest.
+  h_.live.Settle(n);
+  // Whoever sends a cluster knows what acts on it in flight when that was heard before: 2k ticks. `reach` also shows k
+  // ticks ahead what may act within its horizon.
+  const Tick effect = n + 2 * k_ + (reach_ ? margins_.horizon + 1 : 0);
+  for (const Graph& g : said) h_.live.Deliver(g.inputs, effect, g.of == h_.self);
+}
+
 void DelayedExchange::Apply(const Frame& f, RegionId peer) {
+  said_[f.tick].insert(said_[f.tick].end(), f.graphs.begin(), f.graphs.end());
   auto& auras = remote_[peer];
   for (BodyId id : f.gone) auras.erase(id);
   for (const Aura& a : f.auras) auras[a.id] = a;
@@ -180,7 +199,7 @@ void DelayedExchange::Send(std::vector<BodyId> ids, RegionId to, TransferCause c
     if (auto b = bounds_.find(id); b != bounds_.end()) s.bound = b->second;
     shadows_[id] = std::move(s);
   }
-  Transfer t = h_.Depart(ids, to, cause);
+  Transfer t = h_.Depart(ids, cause);
   if (!existing.empty()) t.state = h_.engine->Extract(existing);
   FastForward(&t);
   for (BodyId id : ids) waiting_.erase(id);
@@ -205,14 +224,16 @@ void DelayedExchange::FastForward(Transfer* t) {
   }
   for (Tick n = now(); n < now() + k_ - 1; ++n) {
     std::vector<Input> inputs;
-    ScriptedInputs(h_.world, n, &inputs);
+    h_.AppendInputs(n, &inputs);
     std::erase_if(inputs, [](const Input& i) { return i.kind == Input::Kind::kSpawn; });
     const auto due = std::find_if(t->pending.begin(), t->pending.end(), [n](const Input& i) { return i.tick > n; });
     inputs.insert(inputs.end(), t->pending.begin(), due);
     t->pending.erase(t->pending.begin(), due);
     std::sort(inputs.begin(), inputs.end());
     for (const Input& i : inputs) {
-      if (i.kind == Input::Kind::kSpawn || scratch_->Contains(i.body)) scratch_->Apply(i);
+      if (i.kind != Input::Kind::kSpawn && !scratch_->Contains(i.body)) continue;
+      scratch_->Apply(i);
+      if (i.source != 0) h_.live.Applied(i);
     }
     for (BodyId id : t->ids) {
       Shadow::State& s = shadows_.at(id).states.back();

@@ -41,12 +41,6 @@ class DelayedExchange final : public Protocol {
 
   void ObserveInFlight(std::vector<BodyRecord>* out) const override;
 
-  Tick EffectTick(const Input& input) const override {
-    const Tick next = phase_ == Phase::kBegin ? now() : now() + 1;
-    if (input.kind == Input::Kind::kSpawn) return next + margins_.spawn_notice;
-    return reach_ ? next + margins_.horizon : next;
-  }
-
  private:
   // R12: what a body can do within the horizon, and what its aura says of it.
   struct Bound {
@@ -88,6 +82,8 @@ class DelayedExchange final : public Protocol {
   Tick DueFrame() const;
 
   void Begin();
+  // What all regions said in the frames of tick n.
+  void HearInputs(Tick n);
 
   void Apply(const Frame& f, RegionId peer);
 
@@ -218,6 +214,7 @@ class DelayedExchange final : public Protocol {
   std::map<RegionId, std::vector<Transfer>> leaving_;
   std::map<RegionId, Auras> told_;
   std::map<BodyId, Away> told_away_;
+  std::map<Tick, std::vector<Graph>> said_;  // inputs, by all, in frames that are not yet applied everywhere
 };
 
 }  // namespace aureole

@@ -45,6 +45,11 @@ void DelayedExchange::BoundaryNetworkUpdate(std::vector<Frame>* out) {
   std::map<BodyId, Away> away;
   Project(&next, &away);
   h_.stats.auras_told = 0;
+  Graph said;
+  said.of = h_.self;
+  said.inputs = h_.live.TakeOffered();
+  said.applied = h_.live.TakeApplied();
+  said_[h_.tick].push_back(said);
   for (RegionId peer : h_.peers) {
     Frame f;
     f.from = h_.self;
@@ -52,6 +57,7 @@ void DelayedExchange::BoundaryNetworkUpdate(std::vector<Frame>* out) {
     f.tick = h_.tick;
     Difference(told_[peer], next[peer], &f.auras, &f.gone);
     Difference(told_away_, away, &f.away, &f.away_gone);
+    if (!said.empty()) f.graphs = {said};
     if (auto it = leaving_.find(peer); it != leaving_.end()) f.transfers = std::move(it->second);
     h_.stats.auras_sent += static_cast<int64_t>(f.auras.size());
     h_.stats.auras_told += static_cast<int64_t>(next[peer].size());

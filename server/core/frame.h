@@ -56,7 +56,7 @@ struct LateAura {
   Aura aura;
 };
 
-// What a region says to all in each tick of the synchronous exchange (R16). Nothing to say: it is not passed on.
+// What a region says to all in each tick: k = 0 by R16; k >= 1 the last two only. Nothing to say: it is not passed on.
 struct Graph {
   RegionId of = kNoRegion;
   std::vector<Edge> edges;          // ascending
@@ -64,7 +64,13 @@ struct Graph {
   std::vector<LateAura> late;       // ascending by `to`
   // Regions with which `of` begins, or ceases to need, to exchange boxes from the next tick on; ascending.
   std::vector<RegionId> opened, closed;
-  bool empty() const { return edges.empty() && fragments.empty() && late.empty() && opened.empty() && closed.empty(); }
+  // Inputs of clients offered to `of`, in the order in which they came; and those that `of` has applied.
+  std::vector<Input> inputs;
+  std::vector<InputName> applied;
+  bool empty() const {
+    return edges.empty() && fragments.empty() && late.empty() && opened.empty() && closed.empty() && inputs.empty() &&
+           applied.empty();
+  }
 };
 
 enum class TransferCause : uint8_t {
@@ -79,7 +85,7 @@ struct Transfer {
   std::vector<Epoch> epochs;  // after the transfer, one per id
   TransferCause cause = TransferCause::kAuraCollision;
   std::string state;           // Engine::Extract; of state tick (k = 0), of state tick + k - 1 (k >= 1)
-  std::vector<Input> pending;  // inputs accepted for these bodies that have not taken effect, in order
+  std::vector<Input> pending;  // k >= 1: announced spawns among these bodies, in order
 };
 
 struct Away {

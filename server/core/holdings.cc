@@ -45,6 +45,10 @@ absl::Status ValidateGraph(const Graph& g) {
       if (!std::isfinite(kg) || kg <= 0) return Malformed("graphs.fragments.mass_by_home", "must be > 0 kg");
     }
   }
+  for (const Input& i : g.inputs) {
+    if (absl::Status s = CheckLiveInput(i); !s.ok())
+      return Malformed("graphs.inputs", std::string(s.message()).c_str());
+  }
   for (const LateAura& l : g.late) {
     if (l.aura.id == 0 || !Finite(l.aura.box)) return Malformed("graphs.late", "must have an id and a finite box");
   }
@@ -151,24 +155,26 @@ void Holdings::LoadInitialState(double margin) {
   }
 }
 
+void Holdings::AppendInputs(Tick n, std::vector<Input>* out) const {
+  const auto begin = static_cast<std::ptrdiff_t>(out->size());
+  ScriptedInputs(world, n, out);
+  live.AppendDue(n, out);
+  std::sort(out->begin() + begin, out->end());
+}
+
 void Holdings::ApplyInput(const Input& input) {
   if (input.kind == Input::Kind::kSpawn) {
     held.try_emplace(input.spawn->id);
     engine->Apply(input);
     return;
   }
-  if (!held.contains(input.body)) return;
+  if (!engine->Contains(input.body)) return;
   engine->Apply(input);
   if (input.kind == Input::Kind::kRemove) held.erase(input.body);
+  if (input.source != 0) live.Applied(input);
 }
 
-void Holdings::TakeDueInputs(Tick n, std::vector<Input>* out) {
-  const auto due = std::find_if(pending.begin(), pending.end(), [n](const Input& i) { return i.tick > n; });
-  out->insert(out->end(), pending.begin(), due);
-  pending.erase(pending.begin(), due);
-}
-
-Transfer Holdings::Depart(std::vector<BodyId> ids, RegionId to, TransferCause cause) {
+Transfer Holdings::Depart(std::vector<BodyId> ids, TransferCause cause) {
   Transfer t;
   t.cause = cause;
   for (BodyId id : ids) {
@@ -176,7 +182,6 @@ Transfer Holdings::Depart(std::vector<BodyId> ids, RegionId to, TransferCause ca
     AUREOLE_CHECK(it != held.end(), "region %d does not own body %llu", self, static_cast<unsigned long long>(id));
     t.epochs.push_back(it->second.epoch + 1);
     held.erase(it);
-    sent_to[id] = to;
   }
   for (auto it = pending.begin(); it != pending.end();) {
     if (std::binary_search(ids.begin(), ids.end(), it->body)) {
@@ -207,7 +212,6 @@ void Holdings::Arrive(const Transfer& t, RegionId from, Tick n) {
     const bool fresh = held.emplace(t.ids[i], Held{t.epochs[i], n, transfer}).second;
     AUREOLE_CHECK(fresh, "body %llu came from region %d but region %d owns it",
                   static_cast<unsigned long long>(t.ids[i]), from, self);
-    sent_to.erase(t.ids[i]);
     if (t.cause == TransferCause::kAuraCollision) newcomers_.emplace_back(t.ids[i], transfer);
   }
   pending.insert(pending.end(), t.pending.begin(), t.pending.end());

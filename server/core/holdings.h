@@ -13,6 +13,7 @@
 
 #include "server/core/engine.h"
 #include "server/core/frame.h"
+#include "server/core/live_inputs.h"
 #include "server/core/region.h"
 #include "server/core/world.h"
 
@@ -54,19 +55,18 @@ struct Holdings {
   RegionStats stats;
   std::vector<Violation> violations;
 
-  // The smallest tick at which an input accepted now takes effect, and what was accepted.
-  std::vector<Input> pending;                     // accepted live inputs that have not taken effect, in Input's order
-  std::vector<Input> accepted;                    // since the last TakeAccepted
-  absl::flat_hash_map<BodyId, RegionId> sent_to;  // tombstones: where a body that was here went (P45)
+  std::vector<Input> pending;  // k >= 1: announced spawns of owned bodies that have not taken effect, in Input's order
+  LiveInputs live;
 
   // Adds bodies and joints of state 0 that this region owns.
   void LoadInitialState(double margin);
-  // Every input of tick n that this region applies, in order: scripted ones for bodies held or spawned here, pending
-  // ones. `owns_spawn` says whether a spawn is this region's.
+  // Every input that takes effect at the start of tick n, of the script and of clients, in Input's order, appended. The
+  // same in all regions; it is for the region that holds the body, or is the home of the spawn, to apply it.
+  void AppendInputs(Tick n, std::vector<Input>* out) const;
+  // Applies it when its body is here; a spawn always.
   void ApplyInput(const Input& input);
-  void TakeDueInputs(Tick n, std::vector<Input>* out);
   // Extracts a closed set of owned bodies for a new owner.
-  Transfer Depart(std::vector<BodyId> ids, RegionId to, TransferCause cause);
+  Transfer Depart(std::vector<BodyId> ids, TransferCause cause);
   // Takes over what a peer sent.
   void Arrive(const Transfer& transfer, RegionId from, Tick n);
   void Report(const Violation& v);
@@ -100,8 +100,6 @@ class Protocol {
   // Appends what is in flight from here: stepped by nobody's engine in tick `tick() + 1` (before its step), or in state
   // `tick()`.
   virtual void ObserveInFlight(std::vector<BodyRecord>* out) const = 0;
-  // The tick at which an input accepted now may take effect.
-  virtual Tick EffectTick(const Input& input) const = 0;
 };
 
 std::unique_ptr<Protocol> MakeSyncExchange(Holdings& holdings);

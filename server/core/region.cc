@@ -42,6 +42,21 @@ absl::Status CheckRegions(const Graph& g, int regions) {
   return absl::OkStatus();
 }
 
+// A spawn of the script travels by its name.
+absl::Status FindSpawn(const World& world, Input* spawn) {
+  if (spawn->spawn != nullptr) return absl::OkStatus();
+  std::vector<Input> script;
+  ScriptedInputs(world, spawn->tick, &script);
+  for (const Input& i : script) {
+    if (i.kind != Input::Kind::kSpawn || i.spawn->id != spawn->body) continue;
+    *spawn = i;
+    spawn->body = i.spawn->id;
+    return absl::OkStatus();
+  }
+  return absl::InvalidArgumentError(
+      absl::StrCat("frame.transfers.pending: no spawn of body ", spawn->body, " at tick ", spawn->tick));
+}
+
 }  // namespace
 
 struct Region::Impl {
@@ -76,6 +91,11 @@ absl::Status Region::Receive(Frame frame) {
   for (const Graph& g : frame.graphs) {
     if (absl::Status s = CheckRegions(g, h.world.layout.size()); !s.ok()) return s;
   }
+  for (Transfer& t : frame.transfers) {
+    for (Input& i : t.pending) {
+      if (absl::Status s = FindSpawn(h.world, &i); !s.ok()) return s;
+    }
+  }
   if (!impl_->protocol->MaySend(frame.from, frame.round)) {
     return absl::InvalidArgumentError(
         absl::StrCat("frame.round: ", frame.round, " is not for region ", frame.from, " to send to region ", h.self));
@@ -91,30 +111,9 @@ void Region::Advance(std::vector<Frame>* out) {
   impl_->protocol->Advance(out);
 }
 
-absl::StatusOr<Tick> Region::Submit(Input input) {
-  Holdings& h = impl_->holdings;
-  if (input.kind == Input::Kind::kSpawn) {
-    const RegionId home = h.world.layout.Home(input.spawn->position);
-    if (home != h.self) {
-      return absl::NotFoundError(absl::StrCat("input.spawn.position: is in region ", home, ", not ", h.self));
-    }
-    if (h.held.contains(input.spawn->id)) {
-      return absl::AlreadyExistsError(absl::StrCat("input.spawn.id: body ", input.spawn->id, " exists"));
-    }
-  } else if (!h.held.contains(input.body)) {
-    auto it = h.sent_to.find(input.body);
-    if (it == h.sent_to.end()) {
-      return absl::NotFoundError(absl::StrCat("input.body: body ", input.body, " is not in region ", h.self));
-    }
-    return absl::NotFoundError(absl::StrCat("input.body: body ", input.body, " went to region ", it->second));
-  }
-  input.tick = impl_->protocol->EffectTick(input);
-  h.pending.insert(std::upper_bound(h.pending.begin(), h.pending.end(), input), input);
-  h.accepted.push_back(input);
-  return input.tick;
-}
-
-std::vector<Input> Region::TakeAccepted() { return std::exchange(impl_->holdings.accepted, {}); }
+absl::Status Region::Submit(const Input& input) { return impl_->holdings.live.Offer(input); }
+std::vector<InputOutcome> Region::TakeOutcomes() { return impl_->holdings.live.TakeOutcomes(); }
+std::vector<Input> Region::TakeDelivered() { return impl_->holdings.live.TakeDelivered(); }
 
 void Region::Observe(std::vector<BodyRecord>* out) const {
   const Holdings& h = impl_->holdings;

@@ -22,6 +22,7 @@
 
 #include "server/core/engine.h"
 #include "server/core/frame.h"
+#include "server/core/live_inputs.h"
 #include "server/core/world.h"
 
 namespace aureole {
@@ -97,12 +98,16 @@ class Region {
   // Runs one phase and appends the frames to send. Precondition: Ready().
   void Advance(std::vector<Frame>* out);
 
-  // Accepts a live input (source > 0) for a body that this region owns, or a spawn whose place is in this region. It
-  // takes effect at the earliest safe tick, which is returned. NotFound when the body is not here: the message names
-  // the region it was sent to, if known.
-  absl::StatusOr<Tick> Submit(Input input);
-  // Accepted live inputs with their ticks, in order of acceptance, since the last call.
-  std::vector<Input> TakeAccepted();
+  // Takes an input of a client (source > 0) for any body of the world, wherever it is. It is told to all regions with
+  // the next exchange and takes effect at the start of the tick after that one (k = 0), or as many ticks later as the
+  // delay demands; nothing is known of the body until then. Sequences of one source must grow: one that does not has
+  // been taken before, here or elsewhere, and acts only once. InvalidArgument names the field; then nothing changes.
+  absl::Status Submit(const Input& input);
+  // Since the last call: what became of what was submitted here, each time that it was.
+  std::vector<InputOutcome> TakeOutcomes();
+  // Since the last call: every client's input that takes effect, with its tick, in order of delivery; the same in all
+  // regions, and known before that tick's step.
+  std::vector<Input> TakeDelivered();
 
   // All bodies that this region accounts for: at kStep those that it is about to step, else those of state tick();
   // k >= 1: also those in flight from here that are not yet applied elsewhere.

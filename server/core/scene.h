@@ -5,6 +5,7 @@
 #include <cstdint>
 #include <memory>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "server/core/types.h"
@@ -122,6 +123,9 @@ struct Input {
     return x.sequence < y.sequence;
   }
 };
+
+// Which input: its source and sequence.
+using InputName = std::pair<uint64_t, uint64_t>;
 
 // The part of a world that is the same in every region and never changes owner.
 struct Environment {

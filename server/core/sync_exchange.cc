@@ -77,7 +77,6 @@ class SyncExchange final : public Protocol {
   }
 
   void ObserveInFlight(std::vector<BodyRecord>*) const override {}
-  Tick EffectTick(const Input&) const override { return phase_ == Phase::kBegin ? now() : now() + 1; }
 
  private:
   struct Foreign {
@@ -141,19 +140,23 @@ class SyncExchange final : public Protocol {
   // R13: everything with effect in this tick happens before its exchange. Then R14.
   void Begin(std::vector<Frame>* out) {
     inputs_.clear();
-    ScriptedInputs(h_.world, now(), &inputs_);
-    h_.TakeDueInputs(now(), &inputs_);
+    h_.AppendInputs(now(), &inputs_);
+    h_.live.ForgetBefore(now() + 1);
     for (const Input& i : inputs_) {
-      // A live spawn is pending only where it was accepted; a scripted one belongs to the home of its place.
-      const bool elsewhere =
-          i.kind == Input::Kind::kSpawn && i.source == 0 && h_.world.layout.Home(i.spawn->position) != h_.self;
+      const bool elsewhere = i.kind == Input::Kind::kSpawn && h_.world.layout.Home(i.spawn->position) != h_.self;
       if (!elsewhere) h_.ApplyInput(i);
     }
     near_.clear();
     h_.engine->CollectOutside(h_.rect, kOpenAhead, &near_);
     h_.CountHomes(near_);
     BoundaryNetworkUpdate(out);
-    phase_ = h_.peers.empty() ? Phase::kStep : Phase::kGraph;
+    mine_.inputs = h_.live.TakeOffered();
+    mine_.applied = h_.live.TakeApplied();
+    phase_ = Phase::kGraph;
+    if (!h_.peers.empty()) return;
+    graphs_.assign(1, mine_);
+    HearInputs();
+    phase_ = Phase::kStep;
   }
 
   // The paper's BNU (Algorithm 6), built once per tick (P52). R14: a body is told to every region whose closed
@@ -378,6 +381,7 @@ class SyncExchange final : public Protocol {
       return SendGraph(kGraphsAgain, out);
     }
     OpenAndClose();
+    HearInputs();
     std::map<RegionId, Frame> leaving;
     senders_.clear();
     GiveBackIslands(&leaving);
@@ -398,6 +402,13 @@ class SyncExchange final : public Protocol {
     }
     mine_.late.clear();
     return any;
+  }
+
+  // What all have offered takes effect in the next tick; what took effect in this one, all have said.
+  void HearInputs() {
+    for (const Graph& g : graphs_) h_.live.Heard(g.applied);
+    h_.live.Settle(now());
+    for (const Graph& g : graphs_) h_.live.Deliver(g.inputs, now() + 1, g.of == h_.self);
   }
 
   // Both ends read the same graphs, so both change at the same tick.
@@ -505,7 +516,7 @@ class SyncExchange final : public Protocol {
 
   void Send(std::vector<BodyId> ids, RegionId to, TransferCause cause, std::map<RegionId, Frame>* leaving) {
     std::sort(ids.begin(), ids.end());
-    Transfer t = h_.Depart(std::move(ids), to, cause);
+    Transfer t = h_.Depart(std::move(ids), cause);
     t.state = h_.engine->Extract(t.ids);
     auto it = leaving->find(to);
     if (it == leaving->end()) it = leaving->emplace(to, MakeFrame({to}, kTransfers)).first;

@@ -67,6 +67,16 @@ void EncodeFragment(const Fragment& f, v1::Frame::Fragment* out) {
   out->set_gives_back(static_cast<uint32_t>(f.gives_back + 1));
 }
 
+void EncodeInput(const Input& input, v1::Frame::Input* out) {
+  out->set_source(input.source);
+  out->set_sequence(input.sequence);
+  out->set_kind(static_cast<uint32_t>(input.kind));
+  out->set_body(input.body);
+  if (input.kind == Input::Kind::kRemove) return;
+  out->mutable_linear()->Add(input.linear.data(), input.linear.data() + 3);
+  out->mutable_angular()->Add(input.angular.data(), input.angular.data() + 3);
+}
+
 void EncodeGraph(const Graph& g, v1::Frame::Graph* out) {
   out->set_of(static_cast<uint32_t>(g.of));
   IdWriter edges(out->mutable_edge_a());
@@ -83,10 +93,16 @@ void EncodeGraph(const Graph& g, v1::Frame::Graph* out) {
   }
   for (RegionId r : g.opened) out->add_opened(static_cast<uint32_t>(r));
   for (RegionId r : g.closed) out->add_closed(static_cast<uint32_t>(r));
+  for (const Input& i : g.inputs) EncodeInput(i, out->add_input());
+  for (const auto& [source, sequence] : g.applied) {
+    out->add_applied_source(source);
+    out->add_applied_sequence(sequence);
+  }
 }
 
 bool WithinLimits(const Graph& g) {
-  return g.edges.size() <= kMaxEdges && g.fragments.size() <= kMaxFragments && g.late.size() <= kMaxAuras;
+  return g.edges.size() <= kMaxEdges && g.fragments.size() <= kMaxFragments && g.late.size() <= kMaxAuras &&
+         g.inputs.size() <= kMaxInputs && g.applied.size() <= kMaxApplied;
 }
 
 void EncodeTransfer(const Transfer& t, v1::Frame::Transfer* out) {
@@ -98,17 +114,13 @@ void EncodeTransfer(const Transfer& t, v1::Frame::Transfer* out) {
   out->mutable_epoch()->Add(t.epochs.begin(), t.epochs.end());
   out->set_cause(static_cast<uint32_t>(t.cause));
   out->set_state(t.state);
+  IdWriter spawns(out->mutable_spawn_body());
   for (const Input& input : t.pending) {
-    AUREOLE_CHECK(input.kind != Input::Kind::kSpawn, "pending spawn in the transfer of body %llu",
+    AUREOLE_CHECK(input.kind == Input::Kind::kSpawn, "input %llu of source %llu in the transfer of body %llu",
+                  static_cast<unsigned long long>(input.sequence), static_cast<unsigned long long>(input.source),
                   static_cast<unsigned long long>(input.body));
-    v1::Frame::Input* in = out->add_pending();
-    in->set_tick(input.tick);
-    in->set_source(input.source);
-    in->set_sequence(input.sequence);
-    in->set_kind(static_cast<uint32_t>(input.kind));
-    in->set_body(input.body);
-    in->mutable_linear()->Add(input.linear.data(), input.linear.data() + 3);
-    in->mutable_angular()->Add(input.angular.data(), input.angular.data() + 3);
+    out->add_spawn_tick(input.tick);
+    spawns.Add(input.body);
   }
 }
 
@@ -257,19 +269,6 @@ absl::Status DecodeRegions(const char* field, const google::protobuf::RepeatedFi
   return absl::OkStatus();
 }
 
-absl::Status DecodeGraph(const v1::Frame::Graph& in, Graph* out) {
-  AUREOLE_RETURN_IF_ERROR(DecodeKnownRegion("graph.of", in.of(), &out->of));
-  AUREOLE_RETURN_IF_ERROR(DecodeEdges(in, &out->edges));
-  AUREOLE_RETURN_IF_ERROR(CheckCount("graph.fragment", in.fragment_size(), kMaxFragments));
-  out->fragments.resize(in.fragment_size());
-  for (int i = 0; i < in.fragment_size(); ++i) {
-    AUREOLE_RETURN_IF_ERROR(DecodeFragment(in.fragment(i), &out->fragments[i]));
-  }
-  AUREOLE_RETURN_IF_ERROR(DecodeLate(in, &out->late));
-  AUREOLE_RETURN_IF_ERROR(DecodeRegions("graph.opened", in.opened(), &out->opened));
-  return DecodeRegions("graph.closed", in.closed(), &out->closed);
-}
-
 absl::Status DecodeVector(const char* field, const Doubles& in, Vec3* out) {
   AUREOLE_RETURN_IF_ERROR(CheckColumn(field, in.size(), 3, 1, false));
   *out = Vec3(in.Get(0), in.Get(1), in.Get(2));
@@ -280,16 +279,41 @@ absl::Status DecodeVector(const char* field, const Doubles& in, Vec3* out) {
 absl::Status DecodeInput(const v1::Frame::Input& in, Input* out) {
   if (in.kind() < static_cast<uint32_t>(Input::Kind::kRemove) ||
       in.kind() > static_cast<uint32_t>(Input::Kind::kVelocity)) {
-    return Bad("transfer.pending.kind", absl::StrCat("no input of kind ", in.kind(), " travels"));
+    return Bad("graph.input.kind", absl::StrCat("no input of kind ", in.kind(), " is told"));
   }
-  if (in.tick() < 0 || in.body() == 0) return Bad("transfer.pending", "has no tick or no body");
-  out->tick = in.tick();
+  if (in.source() == 0 || in.sequence() == 0 || in.body() == 0) {
+    return Bad("graph.input", "has no source, sequence or body");
+  }
   out->source = in.source();
   out->sequence = in.sequence();
   out->kind = static_cast<Input::Kind>(in.kind());
   out->body = in.body();
-  AUREOLE_RETURN_IF_ERROR(DecodeVector("transfer.pending.linear", in.linear(), &out->linear));
-  return DecodeVector("transfer.pending.angular", in.angular(), &out->angular);
+  if (out->kind == Input::Kind::kRemove && in.linear().empty() && in.angular().empty()) return absl::OkStatus();
+  AUREOLE_RETURN_IF_ERROR(DecodeVector("graph.input.linear", in.linear(), &out->linear));
+  return DecodeVector("graph.input.angular", in.angular(), &out->angular);
+}
+
+absl::Status DecodeGraph(const v1::Frame::Graph& in, Graph* out) {
+  AUREOLE_RETURN_IF_ERROR(DecodeKnownRegion("graph.of", in.of(), &out->of));
+  AUREOLE_RETURN_IF_ERROR(DecodeEdges(in, &out->edges));
+  AUREOLE_RETURN_IF_ERROR(CheckCount("graph.fragment", in.fragment_size(), kMaxFragments));
+  out->fragments.resize(in.fragment_size());
+  for (int i = 0; i < in.fragment_size(); ++i) {
+    AUREOLE_RETURN_IF_ERROR(DecodeFragment(in.fragment(i), &out->fragments[i]));
+  }
+  AUREOLE_RETURN_IF_ERROR(DecodeLate(in, &out->late));
+  AUREOLE_RETURN_IF_ERROR(DecodeRegions("graph.opened", in.opened(), &out->opened));
+  AUREOLE_RETURN_IF_ERROR(DecodeRegions("graph.closed", in.closed(), &out->closed));
+  AUREOLE_RETURN_IF_ERROR(CheckCount("graph.input", in.input_size(), kMaxInputs));
+  out->inputs.resize(in.input_size());
+  for (int i = 0; i < in.input_size(); ++i) AUREOLE_RETURN_IF_ERROR(DecodeInput(in.input(i), &out->inputs[i]));
+  AUREOLE_RETURN_IF_ERROR(CheckCount("graph.applied_source", in.applied_source_size(), kMaxApplied));
+  AUREOLE_RETURN_IF_ERROR(
+      CheckColumn("graph.applied_sequence", in.applied_sequence_size(), 1, in.applied_source_size(), false));
+  for (int i = 0; i < in.applied_source_size(); ++i) {
+    out->applied.emplace_back(in.applied_source(i), in.applied_sequence(i));
+  }
+  return absl::OkStatus();
 }
 
 // Takes the state's bytes out of `in`.
@@ -303,11 +327,17 @@ absl::Status DecodeTransfer(v1::Frame::Transfer* in, Transfer* out) {
     return Bad("transfer.cause", absl::StrCat("no cause ", in->cause()));
   }
   out->cause = static_cast<TransferCause>(in->cause());
-  if (in->state().empty()) return Bad("transfer.state", "is empty");
+  if (in->state().empty() && in->spawn_body_size() < in->id_size()) return Bad("transfer.state", "is empty");
   out->state = std::move(*in->mutable_state());
-  AUREOLE_RETURN_IF_ERROR(CheckCount("transfer.pending", in->pending_size(), kMaxPending));
-  out->pending.resize(in->pending_size());
-  for (int i = 0; i < in->pending_size(); ++i) AUREOLE_RETURN_IF_ERROR(DecodeInput(in->pending(i), &out->pending[i]));
+  std::vector<BodyId> spawns;
+  AUREOLE_RETURN_IF_ERROR(DecodeIds("transfer.spawn_body", in->spawn_body(), kMaxPending, false, &spawns));
+  AUREOLE_RETURN_IF_ERROR(CheckColumn("transfer.spawn_tick", in->spawn_tick_size(), 1, spawns.size(), false));
+  out->pending.resize(spawns.size());
+  for (size_t i = 0; i < spawns.size(); ++i) {  // the receiver finds the rest in the script
+    out->pending[i].kind = Input::Kind::kSpawn;
+    out->pending[i].tick = in->spawn_tick(static_cast<int>(i));
+    out->pending[i].body = spawns[i];
+  }
   return absl::OkStatus();
 }
 
@@ -321,11 +351,9 @@ bool AnyUnknownFields(const v1::Frame& frame) {
   for (const auto& g : frame.graph()) {
     any |= HasUnknownFields(g);
     for (const auto& f : g.fragment()) any |= HasUnknownFields(f);
+    for (const auto& i : g.input()) any |= HasUnknownFields(i);
   }
-  for (const auto& t : frame.transfer()) {
-    any |= HasUnknownFields(t);
-    for (const auto& p : t.pending()) any |= HasUnknownFields(p);
-  }
+  for (const auto& t : frame.transfer()) any |= HasUnknownFields(t);
   return any;
 }
 

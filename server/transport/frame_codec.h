@@ -11,7 +11,8 @@
 namespace aureole {
 
 // The serialised Frame message. Does not depend on `frame.from` and `frame.to`, so a broadcast is encoded once. A frame
-// beyond link_limits.h, or with a pending spawn, is a broken invariant and stops the process.
+// beyond link_limits.h is a broken invariant and stops the process. Of a pending spawn only tick and body are written:
+// the script says the rest.
 std::string EncodeFrame(const Frame& frame);
 
 // The frame that `from` sent to `to`. InvalidArgument names the field when the bytes are not a frame that EncodeFrame

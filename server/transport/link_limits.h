@@ -23,7 +23,9 @@ inline constexpr size_t kMaxEdges = size_t{1} << 21;  // a few per told body
 inline constexpr size_t kMaxFragments = size_t{1} << 19;
 inline constexpr size_t kMaxTransfers = size_t{1} << 16;
 inline constexpr size_t kMaxTransferBodies = size_t{1} << 17;  // of one cluster
-inline constexpr size_t kMaxPending = size_t{1} << 16;         // inputs that travel with one cluster
+inline constexpr size_t kMaxPending = size_t{1} << 16;         // announced spawns in one cluster
+inline constexpr size_t kMaxInputs = size_t{1} << 12;          // of clients, told by one region in one tick
+inline constexpr size_t kMaxApplied = size_t{1} << 20;         // of them, by one region in one tick
 
 // A received frame is acknowledged at least this often, with the next frame that goes back or alone. Until then its
 // sender keeps it: half a second of frames at three a tick.

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <map>
 #include <memory>
+#include <set>
 
 #include <absl/strings/str_cat.h>
 
@@ -26,6 +27,13 @@ class Run {
     for (const JointSpec& j : world_.joints) reference_->Join(j);
     const int n = world_.layout.size();
     stalled_.resize(n);
+    heard_.resize(static_cast<size_t>(n));
+    std::map<uint64_t, Client> clients;
+    for (const Input& i : s_.live) clients[i.source].inputs.push_back(i);
+    for (auto& [source, client] : clients) {
+      client.region = static_cast<RegionId>(source % static_cast<uint64_t>(n));
+      clients_.push_back(std::move(client));
+    }
     for (RegionId r = 0; r < n; ++r) {
       regions_.push_back(std::make_unique<Region>(world_, r, make_engine(world_.environment)));
     }
@@ -46,6 +54,7 @@ class Run {
           });
       if (!more && checked_ < s_.ticks && verdict_.ok) Fail(checked_ + 1, "I5", "the regions wait for each other");
     }
+    if (verdict_.ok) CheckOutcomes();
     Summarize();
     return verdict_;
   }
@@ -75,7 +84,7 @@ class Run {
       if (!verdict_.ok) return;
       out.clear();
       region.Advance(&out);
-      for (const Input& i : region.TakeAccepted()) accepted_[i.tick].push_back(i);
+      TakeInputs(region);
       for (Frame& f : out) {
         const auto frame = std::make_shared<const Frame>(std::move(f));
         for (RegionId p : frame->to) network_.Send(r, p, frame);
@@ -84,16 +93,60 @@ class Run {
     }
   }
 
-  // Live inputs are offered to each region until the owner takes them.
+  // Each client speaks to one region at a time. Now and then it goes to another, as after a lost connection, and says
+  // all again there.
   void OfferLive(Region& region) {
-    for (const Input& i : s_.live) {
-      if (i.tick > region.tick() || taken_[i.sequence]) continue;
-      if (region.Submit(i).ok()) {
-        taken_[i.sequence] = true;
-        ++verdict_.live_inputs;
+    for (size_t c = 0; c < clients_.size(); ++c) {
+      Client& client = clients_[c];
+      if (client.region != region.self()) continue;
+      for (; client.next < client.inputs.size() && client.inputs[client.next].tick <= region.tick(); ++client.next) {
+        const absl::Status s = region.Submit(client.inputs[client.next]);
+        if (!s.ok()) return Fail(region.tick(), "submit", std::string(s.message()));
+        if (client.next >= client.said) ++verdict_.live_inputs;
+        client.said = std::max(client.said, client.next + 1);
+      }
+      if (client.said == 0 || !rng_.Chance(0.02)) continue;
+      client.region = static_cast<RegionId>(rng_.Below(static_cast<int>(regions_.size())));
+      client.next = 0;
+    }
+  }
+
+  // All regions are told the same, in the same order.
+  void TakeInputs(Region& region) {
+    size_t& heard = heard_[static_cast<size_t>(region.self())];
+    for (const Input& i : region.TakeDelivered()) {
+      if (heard == delivered_.size()) {
+        delivered_.push_back(i);
+        accepted_[i.tick].push_back(i);
+      }
+      const Input& first = delivered_[heard++];
+      if (first.source != i.source || first.sequence != i.sequence || first.tick != i.tick) {
+        return Fail(i.tick, "inputs",
+                    absl::StrCat("region ", region.self(), " was told input ", i.sequence, " of client ", i.source,
+                                 " where others were told another"));
       }
     }
-    for (const Input& i : region.TakeAccepted()) accepted_[i.tick].push_back(i);
+    for (const InputOutcome& o : region.TakeOutcomes()) outcomes_.push_back(o);
+  }
+
+  // Every input has one outcome, however often it was said, and it is that of the undivided world.
+  void CheckOutcomes() {
+    std::set<InputName> known;
+    for (const InputOutcome& o : outcomes_) {
+      const auto it = acted_.find(o.name);
+      if (it == acted_.end() || o.tick != it->second.first || o.applied != it->second.second) {
+        return Fail(o.tick, "inputs",
+                    absl::StrCat("input ", o.name.second, " of client ", o.name.first,
+                                 ": the outcome is not that of the undivided world"));
+      }
+      known.insert(o.name);
+    }
+    for (const auto& [name, acted] : acted_) {
+      if (acted.first + 2 * world_.exchange.k < checked_ && !known.contains(name)) {
+        return Fail(acted.first, "inputs",
+                    absl::StrCat("input ", name.second, " of client ", name.first, " has no outcome"));
+      }
+    }
   }
 
   void Record(const Region& region, Tick n, std::map<Tick, Tally>* tallies, void (Run::*check)(Tick, Tally&)) {
@@ -199,6 +252,7 @@ class Run {
     inputs.insert(inputs.end(), accepted.begin(), accepted.end());
     for (const Input& i : inputs) {
       if (i.kind == Input::Kind::kSpawn) ++verdict_.spawns;
+      if (i.source != 0) acted_[{i.source, i.sequence}] = {n, reference_->Contains(i.body)};
       if (i.kind == Input::Kind::kSpawn || reference_->Contains(i.body)) reference_->Apply(i);
     }
   }
@@ -230,7 +284,16 @@ class Run {
   std::vector<bool> stalled_;
   std::map<Tick, Tally> before_step_, after_step_;
   std::map<Tick, std::vector<Input>> accepted_;
-  std::map<uint64_t, bool> taken_;
+  struct Client {
+    std::vector<Input> inputs;
+    RegionId region = 0;
+    size_t next = 0, said = 0;  // of its inputs
+  };
+  std::vector<Client> clients_;
+  std::vector<Input> delivered_;                      // as the first region heard them
+  std::vector<size_t> heard_;                         // by region
+  std::map<InputName, std::pair<Tick, bool>> acted_;  // in the undivided world: when, and whether its body was there
+  std::vector<InputOutcome> outcomes_;
   std::map<BodyId, int64_t> groups_;
   std::map<BodyId, bool> asleep_;
   std::map<BodyId, std::pair<int64_t, Epoch>> owned_;  // group and epoch when last seen

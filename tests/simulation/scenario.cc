@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <map>
 #include <numeric>
 
 #include "server/core/check.h"
@@ -454,14 +455,15 @@ void AddLive(Scenario* s, int n, Random& rng) {
     Input in;
     in.kind = Input::Kind::kImpulse;
     in.tick = 2 + rng.Below(static_cast<int>(s->ticks * 2 / 3));  // offered then
-    in.source = 1;
-    in.sequence = static_cast<uint64_t>(i + 1);
+    in.source = 1 + static_cast<uint64_t>(i % 3);
     const BodySpec& b = s->world.bodies[rng.Below(static_cast<int>(s->world.bodies.size()))];
     in.body = b.id;
     in.linear = Flat(rng, kSpeed * rng.Unit() * b.mass);
     s->live.push_back(in);
   }
   std::stable_sort(s->live.begin(), s->live.end(), [](const Input& x, const Input& y) { return x.tick < y.tick; });
+  std::map<uint64_t, uint64_t> sequences;
+  for (Input& in : s->live) in.sequence = ++sequences[in.source];
 }
 
 }  // namespace

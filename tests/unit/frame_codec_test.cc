@@ -42,6 +42,18 @@ Frame MakeFrame(bool predicted) {
   g.fragments.push_back({{4, 8, 15}, 2, 9, {{0, 12.5}, {3, 0.1}}, kNoRegion});
   g.fragments.push_back({{1ull << 63}, 1, 1, {}, 4});
   g.late = {{2, MakeAura(~0ull, false)}, {3, MakeAura(6, false)}};
+  Input input;
+  input.source = 4;
+  input.sequence = 17;
+  input.kind = Input::Kind::kVelocity;
+  input.body = 11;
+  input.linear = {0.1, -0.0, 1e-300};
+  input.angular = {1, 2, 3};
+  g.inputs = {input};
+  input.kind = Input::Kind::kRemove;
+  input.linear = input.angular = Vec3::Zero();
+  g.inputs.push_back(input);
+  g.applied = {{4, 16}, {~0ull, 1}};
   f.graphs[1].of = 3;
   f.graphs[1].opened = {0, 7};
   f.graphs[1].closed = {2};
@@ -50,15 +62,11 @@ Frame MakeFrame(bool predicted) {
   t.epochs = {0, 4000000000u};
   t.cause = TransferCause::kBoundaryTraverse;
   t.state = std::string("\0\1\2 state", 9);
-  Input input;
-  input.tick = 123460;
-  input.source = 4;
-  input.sequence = 17;
-  input.kind = Input::Kind::kVelocity;
-  input.body = 11;
-  input.linear = {0.1, -0.0, 1e-300};
-  input.angular = {1, 2, 3};
-  t.pending = {input};
+  Input spawn;
+  spawn.kind = Input::Kind::kSpawn;
+  spawn.tick = 123460;
+  spawn.body = 11;
+  t.pending = {spawn};
   f.transfers = {t, t};
   if (predicted) {
     f.away = {{21, 3, MakeAura(21, false).box}, {20, kNoRegion, MakeAura(20, false).box}};
@@ -85,6 +93,13 @@ void ExpectSame(const Graph& a, const Graph& b) {
     EXPECT_EQ(a.late[i].to, b.late[i].to);
     EXPECT_EQ(a.late[i].aura, b.late[i].aura);
   }
+  ASSERT_EQ(a.inputs.size(), b.inputs.size());
+  for (size_t i = 0; i < a.inputs.size(); ++i) {
+    const Input &p = a.inputs[i], &q = b.inputs[i];
+    EXPECT_TRUE(p.source == q.source && p.sequence == q.sequence && p.kind == q.kind && p.body == q.body);
+    EXPECT_TRUE(SameBits(p.linear, q.linear) && SameBits(p.angular, q.angular));
+  }
+  EXPECT_EQ(a.applied, b.applied);
   EXPECT_EQ(a.opened, b.opened);
   EXPECT_EQ(a.closed, b.closed);
 }
@@ -109,9 +124,7 @@ void ExpectSame(const Frame& a, const Frame& b) {
     ASSERT_EQ(x.pending.size(), y.pending.size());
     for (size_t j = 0; j < x.pending.size(); ++j) {
       const Input &p = x.pending[j], &q = y.pending[j];
-      EXPECT_EQ(std::tie(p.tick, p.source, p.sequence, p.kind, p.body),
-                std::tie(q.tick, q.source, q.sequence, q.kind, q.body));
-      EXPECT_TRUE(SameBits(p.linear, q.linear) && SameBits(p.angular, q.angular));
+      EXPECT_TRUE(p.tick == q.tick && p.kind == q.kind && p.body == q.body);
     }
   }
   EXPECT_EQ(a.away, b.away);
@@ -209,9 +222,12 @@ TEST(FrameCodec, RefusesWhatNoRegionSends) {
   refused("frame.transfer.epoch", [](v1::Frame* f) { f->mutable_transfer(0)->add_epoch(1); });
   refused("frame.transfer.cause", [](v1::Frame* f) { f->mutable_transfer(0)->set_cause(4); });
   refused("frame.transfer.state", [](v1::Frame* f) { f->mutable_transfer(0)->clear_state(); });
-  refused("frame.transfer.pending.kind", [](v1::Frame* f) { f->mutable_transfer(0)->mutable_pending(0)->set_kind(1); });
-  refused("frame.transfer.pending.linear",
-          [](v1::Frame* f) { f->mutable_transfer(0)->mutable_pending(0)->set_linear(1, NAN); });
+  refused("frame.transfer.spawn_tick", [](v1::Frame* f) { f->mutable_transfer(0)->add_spawn_tick(1); });
+  refused("frame.transfer.spawn_body", [](v1::Frame* f) { f->mutable_transfer(0)->set_spawn_body(0, 0); });
+  refused("frame.graph.input.kind", [](v1::Frame* f) { f->mutable_graph(0)->mutable_input(0)->set_kind(1); });
+  refused("frame.graph.input", [](v1::Frame* f) { f->mutable_graph(0)->mutable_input(0)->set_source(0); });
+  refused("frame.graph.input.linear", [](v1::Frame* f) { f->mutable_graph(0)->mutable_input(0)->set_linear(1, NAN); });
+  refused("frame.graph.applied_sequence", [](v1::Frame* f) { f->mutable_graph(0)->add_applied_sequence(1); });
   refused("frame.away_owner", [](v1::Frame* f) { f->set_away_owner(1, kMaxRegions + 1); });
   refused("frame.away_box", [](v1::Frame* f) { f->add_away_box(1); });
   refused("frame.away_gone_id", [](v1::Frame* f) { f->set_away_gone_id(0, 0); });
@@ -271,8 +287,8 @@ TEST(FrameCodec, DamagedBytesAreRefusedOrHarmless) {
 
 TEST(FrameCodecDeathTest, PendingSpawnStopsTheProcess) {
   Frame frame = MakeFrame(false);
-  frame.transfers[0].pending[0].kind = Input::Kind::kSpawn;
-  EXPECT_DEATH(EncodeFrame(frame), "pending spawn in the transfer of body 11");
+  frame.transfers[0].pending[0].kind = Input::Kind::kImpulse;
+  EXPECT_DEATH(EncodeFrame(frame), "in the transfer of body 11");
 }
 
 }  // namespace

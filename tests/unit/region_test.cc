@@ -1,6 +1,7 @@
 #include "server/core/region.h"
 
 #include <array>
+#include <cmath>
 #include <map>
 #include <vector>
 
@@ -199,9 +200,9 @@ TEST(Region, InputsOfOneTickApplyInTheirOrder) {
     in.sequence = 1;
     in.body = 1;
     in.linear = {source == 1 ? 5.0 : 2.0, 0, 0};
-    ASSERT_EQ(*s.region(0).Submit(in), 11);
+    ASSERT_TRUE(s.region(0).Submit(in).ok());
   }
-  s.RunTo(11);
+  s.RunTo(12);
   EXPECT_DOUBLE_EQ(s.region(0).engine().View(1).velocity.x(), 7.0) << "set to 5, then 2 more";
 }
 
@@ -244,22 +245,84 @@ TEST(Region, FrameOfAStrangerIsRefusedWithAReasonAndChangesNothing) {
   EXPECT_EQ(s.Hash(), hash);
 }
 
-TEST(Region, LiveInputTakesEffectInTheNextTickAndElsewhereNamesTheOwner) {
+Input Kick(uint64_t sequence, BodyId body, double speed = 3) {
+  Input i;
+  i.kind = Input::Kind::kVelocity;
+  i.source = 9;
+  i.sequence = sequence;
+  i.body = body;
+  i.linear = {speed, 0, 0};
+  return i;
+}
+
+TEST(Region, InputOfAClientActsWhereverItWasOfferedTwoTicksLater) {
   World w = TwoColumns();
   w.bodies = {Ball(1, -5)};
   Lockstep s(w);
   s.RunTo(10);
-  Input kick;
-  kick.kind = Input::Kind::kImpulse;
-  kick.source = 1;
-  kick.sequence = 1;
-  kick.body = 1;
-  kick.linear = {3, 0, 0};
-  EXPECT_THAT(std::string(s.region(1).Submit(kick).status().message()), HasSubstr("is not in region 1"));
-  ASSERT_EQ(*s.region(0).Submit(kick), 11);
+  ASSERT_TRUE(s.region(1).Submit(Kick(1, 1)).ok()) << "the body is in region 0";
   s.RunTo(11);
-  EXPECT_DOUBLE_EQ(s.region(0).engine().View(1).velocity.x(), 3.0);
-  EXPECT_EQ(s.region(0).TakeAccepted().size(), 1u);
+  EXPECT_DOUBLE_EQ(s.region(0).engine().View(1).velocity.x(), 0) << "it is told in this tick";
+  s.RunTo(12);
+  EXPECT_DOUBLE_EQ(s.region(0).engine().View(1).velocity.x(), 3);
+  const std::vector<InputOutcome> outcomes = s.region(1).TakeOutcomes();
+  ASSERT_EQ(outcomes.size(), 1u);
+  EXPECT_EQ(outcomes[0].tick, 12);
+  EXPECT_TRUE(outcomes[0].applied);
+  for (RegionId r : {0, 1}) {
+    const std::vector<Input> delivered = s.region(r).TakeDelivered();
+    ASSERT_EQ(delivered.size(), 1u);
+    EXPECT_EQ(delivered[0].tick, 12);
+  }
+  EXPECT_TRUE(s.region(0).TakeOutcomes().empty()) << "it was not offered there";
+}
+
+TEST(Region, WhatAClientRepeatsActsOnceAndHasTheSameOutcome) {
+  World w = TwoColumns();
+  w.bodies = {Ball(1, -5)};
+  Lockstep s(w);
+  Input hit = Kick(1, 1);
+  hit.kind = Input::Kind::kImpulse;
+  hit.linear *= 2;
+  ASSERT_TRUE(s.region(0).Submit(hit).ok());
+  ASSERT_TRUE(s.region(1).Submit(hit).ok());
+  s.RunTo(5);
+  const double speed = s.region(0).engine().View(1).velocity.x();
+  ASSERT_GT(speed, 0);
+  ASSERT_TRUE(s.region(1).Submit(hit).ok()) << "long after";
+  s.RunTo(10);
+  EXPECT_DOUBLE_EQ(s.region(0).engine().View(1).velocity.x(), speed);
+  EXPECT_EQ(s.region(0).TakeOutcomes().size(), 1u);
+  const std::vector<InputOutcome> outcomes = s.region(1).TakeOutcomes();
+  ASSERT_EQ(outcomes.size(), 2u);
+  for (const InputOutcome& o : outcomes) {
+    EXPECT_EQ(o.tick, 2);
+    EXPECT_TRUE(o.applied);
+  }
+}
+
+TEST(Region, InputForABodyThatIsNowhereIsNotApplied) {
+  Lockstep s(TwoColumns());
+  ASSERT_TRUE(s.region(0).Submit(Kick(1, 77)).ok());
+  s.RunTo(5);
+  const std::vector<InputOutcome> outcomes = s.region(0).TakeOutcomes();
+  ASSERT_EQ(outcomes.size(), 1u);
+  EXPECT_FALSE(outcomes[0].applied);
+}
+
+TEST(Region, InputThatCannotBeIsRefusedWithTheField) {
+  Lockstep s(TwoColumns());
+  const auto refused = [&](const char* field, auto change) {
+    Input i = Kick(1, 1);
+    change(&i);
+    EXPECT_THAT(std::string(s.region(0).Submit(i).message()), HasSubstr(field));
+  };
+  refused("input.source", [](Input* i) { i->source = 0; });
+  refused("input.sequence", [](Input* i) { i->sequence = 0; });
+  refused("input.body", [](Input* i) { i->body = 0; });
+  refused("input.kind", [](Input* i) { i->kind = Input::Kind::kSpawn; });
+  refused("input.linear", [](Input* i) { i->linear.x() = std::nan(""); });
+  refused("input.angular", [](Input* i) { i->angular.y() = -HUGE_VAL; });
 }
 
 }  // namespace

@@ -1,0 +1,88 @@
+// Inputs of clients: offered to any region, told to all with the exchange, applied by whoever holds the body.
+//
+// Every region hears the same inputs in the same order, so all know from the same tick on what will act and when, and
+// it does not matter where a body is or who moves it meanwhile. Of each source only sequences that grow count: what a
+// client repeats, here or at another region, acts once. Whoever applies an input says so with the exchange, so that
+// every region knows what became of it.
+#pragma once
+
+#include <cstdint>
+#include <deque>
+#include <map>
+#include <utility>
+#include <vector>
+
+#include <absl/status/status.h>
+
+#include "server/core/scene.h"
+
+namespace aureole {
+
+// What became of an input that was offered here.
+struct InputOutcome {
+  InputName name;
+  Tick tick = 0;         // at whose start it took effect, or would have
+  bool applied = false;  // false: no region had its body then
+};
+
+// InvalidArgument when it is no impulse, velocity or removal of a client, or is not finite.
+absl::Status CheckLiveInput(const Input& input);
+
+class LiveInputs {
+ public:
+  // Most inputs that a region tells in one tick; more wait for the next.
+  static constexpr size_t kMostPerTick = 1024;
+  // Outcomes kept of each source, for what it repeats.
+  static constexpr size_t kKeptOutcomes = 1024;
+
+  // Takes an input for the next exchange, after CheckLiveInput.
+  absl::Status Offer(const Input& input);
+  size_t offered() const { return offered_.size(); }
+
+  // At most kMostPerTick of what was offered, in order, to be told to all.
+  std::vector<Input> TakeOffered();
+  // What a region told; it takes effect at tick `effect`. Called alike in every region: same order, same tick. `mine`:
+  // this region told it.
+  void Deliver(const std::vector<Input>& inputs, Tick effect, bool mine);
+  // Inputs that take effect at tick n, appended.
+  void AppendDue(Tick n, std::vector<Input>* out) const;
+  // Forgets inputs of ticks before n.
+  void ForgetBefore(Tick n) { due_.erase(due_.begin(), due_.lower_bound(n)); }
+
+  // This region has applied it.
+  void Applied(const Input& input) { applied_.emplace_back(input.source, input.sequence); }
+  // What was applied here since the last call, to be told to all.
+  std::vector<InputName> TakeApplied() { return std::exchange(applied_, {}); }
+  // A region, this one too, has applied these.
+  void Heard(const std::vector<InputName>& applied);
+  // All regions have been heard about inputs up to this tick.
+  void Settle(Tick n);
+
+  // Since the last call: of inputs offered here, each time that one was offered.
+  std::vector<InputOutcome> TakeOutcomes() { return std::exchange(outcomes_, {}); }
+  // Since the last call: every input that will take effect, with its tick, the same in all regions.
+  std::vector<Input> TakeDelivered() { return std::exchange(delivered_, {}); }
+
+ private:
+  struct Source {
+    uint64_t last = 0;  // sequence delivered
+    std::deque<InputOutcome> recent;
+  };
+  struct Open {
+    bool applied = false;
+    int mine = 0;  // how often it was offered here
+  };
+
+  void Repeated(const Source& source, const InputName& name);
+
+  std::deque<Input> offered_;
+  std::map<Tick, std::vector<Input>> due_;
+  std::map<std::pair<Tick, InputName>, Open> open_;  // not settled
+  std::map<InputName, Tick> effect_;                 // of these
+  std::map<uint64_t, Source> sources_;
+  std::vector<InputName> applied_;
+  std::vector<InputOutcome> outcomes_;
+  std::vector<Input> delivered_;
+};
+
+}  // namespace aureole
