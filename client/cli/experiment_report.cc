@@ -65,6 +65,7 @@ Json RowJson(const Row& row, const Experiment& experiment) {
               {"longest_chain", m.longest_chain},
               {"away_from_home", m.AwayFromHome()},
               {"transfers_per_home_crossing", nullptr},
+              {"moves_per_home_crossing", nullptr},
               {"bytes_sent", m.bytes_sent},
               {"waits", m.waits},
               {"wait_s", static_cast<double>(m.wait_us) * 1e-6},
@@ -76,7 +77,8 @@ Json RowJson(const Row& row, const Experiment& experiment) {
               {"windows", WindowsJson(m)},
               {"servers", RegionsJson(m)}};
   if (row.comparison.first_difference > 0) out["first_difference"] = row.comparison.first_difference;
-  if (const auto moves = m.TransfersPerHomeCrossing()) out["transfers_per_home_crossing"] = *moves;
+  if (const auto transfers = m.TransfersPerHomeCrossing()) out["transfers_per_home_crossing"] = *transfers;
+  if (const auto moves = m.MovesPerHomeCrossing()) out["moves_per_home_crossing"] = *moves;
   return out;
 }
 

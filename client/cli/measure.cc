@@ -49,6 +49,11 @@ double RunMeasure::AwayFromHome() const {
 
 std::optional<double> RunMeasure::TransfersPerHomeCrossing() const {
   if (home_crossings == 0) return std::nullopt;
+  return static_cast<double>(transfers) / static_cast<double>(home_crossings);
+}
+
+std::optional<double> RunMeasure::MovesPerHomeCrossing() const {
+  if (home_crossings == 0) return std::nullopt;
   return static_cast<double>(bodies_moved) / static_cast<double>(home_crossings);
 }
 

@@ -49,8 +49,10 @@ struct RunMeasure {
   double LastMaxFrameMs() const { return windows.empty() ? 0 : windows.back().max_frame_ms; }
   // Share of body-ticks that were hosted away from home.
   double AwayFromHome() const;
-  // Ownership moves of bodies for each time that a body crossed a border of homes; nothing when none crossed.
+  // For each time that a body crossed a border of homes: transfers of clusters, and bodies moved in them; nothing when
+  // none crossed.
   std::optional<double> TransfersPerHomeCrossing() const;
+  std::optional<double> MovesPerHomeCrossing() const;
 };
 
 // Ticks from the arrival of a body that came to be with others to its first touch of one of them.

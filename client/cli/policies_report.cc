@@ -105,6 +105,7 @@ Json RunJson(const PolicyRun& run, const PolicyScene& scene) {
               {"away_from_home", f.away},
               {"most_hosted", f.most_hosted},
               {"transfers_per_home_crossing", nullptr},
+              {"moves_per_home_crossing", nullptr},
               {"mean_frame_ms", f.mean_ms},
               {"max_frame_ms", f.max_ms},
               {"ratio", f.of_one},
@@ -116,12 +117,13 @@ Json RunJson(const PolicyRun& run, const PolicyScene& scene) {
               {"aims", nullptr}};
   if (run.exchange.k > 0) out["policy"] = run.exchange.reach ? "reach" : "tolerance";
   if (run.comparison.first_difference > 0) out["first_difference"] = run.comparison.first_difference;
-  if (f.moves) out["transfers_per_home_crossing"] = *f.moves;
+  if (const auto transfers = m.TransfersPerHomeCrossing()) out["transfers_per_home_crossing"] = *transfers;
+  if (f.moves) out["moves_per_home_crossing"] = *f.moves;
   if (bar) {
     out["aims"] = {{"away_from_home", bar->away},
                    {"away_from_home_met", AwayMet(f, *bar)},
-                   {"transfers_per_home_crossing", bar->moves},
-                   {"transfers_per_home_crossing_met", MovesMet(f, *bar)}};
+                   {"moves_per_home_crossing", bar->moves},
+                   {"moves_per_home_crossing_met", MovesMet(f, *bar)}};
   }
   return out;
 }
@@ -143,7 +145,7 @@ PolicyFigures FiguresOf(const PolicyRun& run, const PolicyScene& scene) {
   const RunMeasure& m = run.measure;
   PolicyFigures out;
   out.away = m.AwayFromHome();
-  out.moves = m.TransfersPerHomeCrossing();
+  out.moves = m.MovesPerHomeCrossing();
   out.mean_ms = MeanMs(m);
   out.max_ms = MaxMs(m);
   if (const double one = MeanMs(scene.reference); one > 0) out.of_one = out.mean_ms / one;
@@ -243,7 +245,7 @@ Json ToJson(const PolicyTable& table) {
 std::string ToCsv(const PolicyTable& table) {
   std::string csv =
       "world,density,kicks,policy,k,hash_equal,violations,away,most_hosted,largest_component,largest_cluster,"
-      "bodies_moved,home_crossings,mean_frame_ms,max_frame_ms,of_one,waits_per_tick,wait_ms_per_tick,"
+      "transfers,bodies_moved,home_crossings,mean_frame_ms,max_frame_ms,of_one,waits_per_tick,wait_ms_per_tick,"
       "bytes_per_tick_and_link,slack_min,slack_p50\n";
   for (const PolicyScene& scene : table.scenes) {
     for (const PolicyRun& run : scene.runs) {
@@ -251,11 +253,11 @@ std::string ToCsv(const PolicyTable& table) {
       const RunMeasure& m = run.measure;
       const std::optional<SlackQuantiles> slack = QuantilesOf(m.slack);
       const char* policy = run.exchange.k == 0 ? "" : run.exchange.reach ? "reach" : "tolerance";
-      absl::StrAppendFormat(&csv, "%s,%g,%s,%s,%d,%d,%d,%.6f,%.4f,%d,%d,%d,%d,%.4f,%.4f,%.4f,%.4f,%.4f,%.1f,%s,%s\n",
+      absl::StrAppendFormat(&csv, "%s,%g,%s,%s,%d,%d,%d,%.6f,%.4f,%d,%d,%d,%d,%d,%.4f,%.4f,%.4f,%.4f,%.4f,%.1f,%s,%s\n",
                             scene.world, scene.density, scene.fast ? "fast" : "slow", policy, run.exchange.k,
                             run.comparison.hash_equal ? 1 : 0, m.violations, f.away, f.most_hosted, m.largest_component,
-                            m.largest_cluster, m.bodies_moved, m.home_crossings, f.mean_ms, f.max_ms, f.of_one, f.waits,
-                            f.wait_ms, f.bytes, slack ? absl::StrCat(slack->min) : "",
+                            m.largest_cluster, m.transfers, m.bodies_moved, m.home_crossings, f.mean_ms, f.max_ms,
+                            f.of_one, f.waits, f.wait_ms, f.bytes, slack ? absl::StrCat(slack->min) : "",
                             slack ? absl::StrCat(slack->p50) : "");
     }
   }

@@ -106,13 +106,15 @@ TEST(ExperimentMeasure, TotalsAreSumsAndLargestValuesOverRegions) {
   a.set_largest_cluster(9), b.set_largest_cluster(5);
   a.set_body_ticks(300), b.set_body_ticks(100);
   a.set_away_body_ticks(3), b.set_away_body_ticks(1);
-  a.set_bodies_moved(6), a.set_home_crossings(3);
+  a.set_bodies_moved(6), a.set_home_crossings(3), b.set_transfers(3);
   const RunMeasure m = Measure(result, 16000);
   EXPECT_EQ(m.bodies, 7);
   EXPECT_EQ(m.largest_cluster, 9);
   EXPECT_DOUBLE_EQ(m.AwayFromHome(), 0.01);
-  EXPECT_EQ(m.TransfersPerHomeCrossing(), 2.0);
+  EXPECT_EQ(m.TransfersPerHomeCrossing(), 1.0);
+  EXPECT_EQ(m.MovesPerHomeCrossing(), 2.0);
   EXPECT_FALSE(RunMeasure().TransfersPerHomeCrossing().has_value());
+  EXPECT_FALSE(RunMeasure().MovesPerHomeCrossing().has_value());
 }
 
 TEST(ExperimentMeasure, RepeatsAreAveraged) {

@@ -82,7 +82,7 @@ TEST(ExperimentReport, JsonHasWhatTheRunsMeasured) {
   EXPECT_EQ(run["lost"], 0);
   EXPECT_EQ(run["doubled"], 0);
   EXPECT_EQ(run["violations"], 0);
-  EXPECT_EQ(run["transfers_per_home_crossing"], 1.5);
+  EXPECT_EQ(run["moves_per_home_crossing"], 1.5);
   EXPECT_TRUE(run["slack_at_first_touch"].is_null()) << "nobody met anybody";
   EXPECT_DOUBLE_EQ(run["ratio"], 0.3);
   EXPECT_EQ(run["windows"].size(), 2u);
@@ -90,6 +90,7 @@ TEST(ExperimentReport, JsonHasWhatTheRunsMeasured) {
   EXPECT_EQ(run["windows"][1]["max_frame_ms"], 12.0);
   EXPECT_EQ(run["windows"][1]["mean_frame_ms"], 6.0);
   EXPECT_TRUE(json["runs"][0]["transfers_per_home_crossing"].is_null());
+  EXPECT_TRUE(json["runs"][0]["moves_per_home_crossing"].is_null());
 }
 
 TEST(ExperimentReport, CsvHasALineForEachWindowAndTheReferenceOnce) {

@@ -93,7 +93,7 @@ TEST(PoliciesReport, NoCrossingIsADashAndNull) {
   PolicyScene scene = Scene(0.5, {4, 5, 6, 7, 8});
   for (PolicyRun& run : scene.runs) run.measure.home_crossings = 0;
   EXPECT_FALSE(FiguresOf(scene.runs[0], scene).moves.has_value());
-  EXPECT_TRUE(ToJson(Table({scene}))["scenes"][0]["runs"][0]["transfers_per_home_crossing"].is_null());
+  EXPECT_TRUE(ToJson(Table({scene}))["scenes"][0]["runs"][0]["moves_per_home_crossing"].is_null());
 }
 
 TEST(PoliciesReport, RunThatDiffersIsNamedWithItsTickAndCannotWin) {
