@@ -90,6 +90,13 @@ void LiveInputs::Settle(Tick n) {
     effect_.erase(outcome.name);
     open_.erase(open_.begin());
   }
+  if (n % kKeptTicks == 0) ForgetOutcomes(n);
+}
+
+void LiveInputs::ForgetOutcomes(Tick n) {
+  for (auto& [id, source] : sources_) {
+    if (!source.recent.empty() && source.recent.back().tick + kKeptTicks < n) source.recent = {};
+  }
 }
 
 }  // namespace aureole

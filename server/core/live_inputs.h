@@ -32,8 +32,9 @@ class LiveInputs {
  public:
   // Most inputs that a region tells in one tick; more wait for the next.
   static constexpr size_t kMostPerTick = 1024;
-  // Outcomes kept of each source, for what it repeats.
+  // Outcomes kept of each source, for what it repeats, and ticks after which those of a source that says nothing go.
   static constexpr size_t kKeptOutcomes = 1024;
+  static constexpr Tick kKeptTicks = 4096;
 
   // Takes an input for the next exchange, after CheckLiveInput.
   absl::Status Offer(const Input& input);
@@ -74,6 +75,7 @@ class LiveInputs {
   };
 
   void Repeated(const Source& source, const InputName& name);
+  void ForgetOutcomes(Tick n);
 
   std::deque<Input> offered_;
   std::map<Tick, std::vector<Input>> due_;

@@ -71,6 +71,7 @@ bool TickLoop::SleepUntilDue(Tick n) {
 
 bool TickLoop::RunTick() {
   const Tick n = region_->tick() + 1;
+  OfferInputs();
   while (region_->tick() < n) {
     if (!AwaitPeers()) return false;
     out_.clear();
@@ -79,6 +80,15 @@ bool TickLoop::RunTick() {
   }
   lap_of_ = n;
   return true;
+}
+
+void TickLoop::OfferInputs() {
+  for (const Input& input : hooks_.inputs()) {
+    if (absl::Status s = region_->Submit(input); !s.ok()) {
+      hooks_.log(
+          absl::StrCat("input ", input.sequence, " of client ", input.source, " refused: ", std::string(s.message())));
+    }
+  }
 }
 
 // Until the region can go on; false when stopped. Reports go out meanwhile, and say for whom it waits.
@@ -156,6 +166,10 @@ void TickLoop::AfterTick() {
     region_->Observe(&records);
     hash->set_bodies(static_cast<int64_t>(records.size()));
   }
+  if (const std::vector<InputOutcome> outcomes = region_->TakeOutcomes(); !outcomes.empty()) {
+    hooks_.outcomes(outcomes);
+  }
+  region_->TakeDelivered();  // nobody records them yet
   for (const Violation& v : region_->TakeViolations()) {
     hooks_.log(absl::StrCat("violation at tick ", v.tick, ": body ", v.own, " of this region and body ", v.foreign,
                             " were stepped apart although they touch, ", v.depth, " m deep at ", v.speed, " m/s"));

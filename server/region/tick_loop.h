@@ -27,6 +27,8 @@ class TickLoop {
   };
   // All called on the tick thread.
   struct Hooks {
+    std::function<std::vector<Input>()> inputs;  // before each tick: what clients offer
+    std::function<void(const std::vector<InputOutcome>&)> outcomes;
     std::function<void(const FrameSample&)> after_tick;
     std::function<void(const Region&, int64_t bodies)> publish;  // after each tick
     std::function<void(const v1::Report&)> report;
@@ -46,6 +48,7 @@ class TickLoop {
 
   bool SleepUntilDue(Tick n);
   bool RunTick();
+  void OfferInputs();
   bool AwaitPeers();
   void Take(Clock::time_point deadline);
   void EndLap();

@@ -192,7 +192,13 @@ grpc::ServerWriteReactor<v1::Replicas>* SimulationService::StreamReplicas(grpc::
   return watcher;
 }
 
+grpc::ServerReadReactor<v1::ImpulseBatch>* SimulationService::ApplyImpulses(grpc::CallbackServerContext*,
+                                                                            v1::ImpulseSummary* response) {
+  return impulses_.Apply(response);
+}
+
 void SimulationService::Serve(const v1::Assignment& assignment, const World& world) {
+  impulses_.Serve();
   const std::lock_guard lock(mutex_);
   serving_ = true;
   world_.Clear();
@@ -212,6 +218,7 @@ void SimulationService::Serve(const v1::Assignment& assignment, const World& wor
 }
 
 void SimulationService::Stop() {
+  impulses_.Stop();
   const std::lock_guard lock(mutex_);
   serving_ = false;
   for (Watcher* w : watchers_) w->End({grpc::StatusCode::UNAVAILABLE, "this server gives up its region"});

@@ -14,6 +14,7 @@
 #include "aureole/v1/simulation.grpc.pb.h"
 #include "server/core/region.h"
 #include "server/core/world.h"
+#include "server/transport/impulse_service.h"
 
 namespace aureole {
 
@@ -30,6 +31,12 @@ class SimulationService final : public v1::Simulation::CallbackService {
   grpc::ServerWriteReactor<v1::Replicas>* StreamReplicas(grpc::CallbackServerContext* context,
                                                          const v1::StreamReplicasRequest* request) override;
 
+  grpc::ServerReadReactor<v1::ImpulseBatch>* ApplyImpulses(grpc::CallbackServerContext* context,
+                                                           v1::ImpulseSummary* response) override;
+
+  // What clients push.
+  ImpulseService& impulses() { return impulses_; }
+
   // From here on this region is served.
   void Serve(const v1::Assignment& assignment, const World& world);
   // Ends all streams. Publish is not called after it.
@@ -40,6 +47,7 @@ class SimulationService final : public v1::Simulation::CallbackService {
  private:
   class Watcher;
 
+  ImpulseService impulses_;
   std::atomic<int> watching_ = 0;  // size of watchers_
   std::atomic<Tick> tick_ = 0;
   std::atomic<int64_t> bodies_ = 0;

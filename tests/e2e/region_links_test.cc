@@ -91,6 +91,8 @@ class Cluster {
       options.last_tick = kTicks;
       options.hash_every = kHashEvery;
       TickLoop::Hooks hooks;
+      hooks.inputs = [] { return std::vector<Input>(); };
+      hooks.outcomes = [](const std::vector<InputOutcome>&) {};
       hooks.after_tick = [](const FrameSample&) {};
       hooks.publish = [this](const Region& region, int64_t) {
         const std::lock_guard lock(mutex_);
