@@ -1,6 +1,7 @@
 // Regions in lock-step without a network, for tests that ask who owns what.
 #pragma once
 
+#include <algorithm>
 #include <cstdio>
 #include <cstdlib>
 #include <map>
@@ -91,10 +92,16 @@ class Undivided {
     for (const BodySpec& b : world.bodies) engine_->Spawn(b);
     for (const JointSpec& j : world.joints) engine_->Join(j);
   }
+  // Takes effect at its tick, which is to come.
+  void Add(const Input& input) { live_.push_back(input); }
   void RunTo(Tick n) {
     while (tick_ < n) {
       std::vector<Input> inputs;
       ScriptedInputs(world_, ++tick_, &inputs);
+      for (const Input& i : live_) {
+        if (i.tick == tick_) inputs.push_back(i);
+      }
+      std::sort(inputs.begin(), inputs.end());
       for (const Input& i : inputs) {
         if (i.kind == Input::Kind::kSpawn || engine_->Contains(i.body)) engine_->Apply(i);
       }
@@ -111,6 +118,7 @@ class Undivided {
  private:
   const World& world_;
   std::unique_ptr<Engine> engine_;
+  std::vector<Input> live_;
   Tick tick_ = 0;
 };
 

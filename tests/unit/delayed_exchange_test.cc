@@ -113,6 +113,33 @@ TEST_P(DelayedExchange, SlackIsTheTimeFromArrivalToFirstTouch) {
   }
 }
 
+// R11: what acts on a body in flight was heard before it was sent. Here something acts in every tick.
+TEST_P(DelayedExchange, InputsOfClientsActInFlightToo) {
+  World w = WeightlessWorld(*Layout::Columns(std::array{0.0}), GetParam());
+  w.bodies = {Ball(1, {-6, 0, 0}, 10)};
+  Lockstep split(w);
+  Undivided whole(split.world());
+  int64_t changes = 0;
+  RegionId before = 0;
+  for (Tick n = 1; n <= 200; ++n) {
+    Input kick;
+    kick.kind = Input::Kind::kVelocity;
+    kick.source = 1;
+    kick.sequence = static_cast<uint64_t>(n);
+    kick.body = 1;
+    kick.linear = {n % 100 < 50 ? 10.0 : -10.0, 0, 0.01 * static_cast<double>(n)};
+    ASSERT_TRUE(split.region(n % 2 == 0 ? 0 : 1).Submit(kick).ok());
+    split.RunTo(n);
+    for (const Input& i : split.region(0).TakeDelivered()) whole.Add(i);
+    whole.RunTo(n);
+    ASSERT_EQ(split.Hash(), whole.Hash()) << "tick " << n;
+    const RegionId owner = split.Owner(1);
+    changes += owner != kNoRegion && owner != before;
+    if (owner != kNoRegion) before = owner;
+  }
+  EXPECT_GE(changes, 2);
+}
+
 // Joules that region `from` told region `to` of the body in the last tick; negative when it said nothing new of it.
 double EnergyTold(const Lockstep& split, RegionId from, RegionId to, BodyId id) {
   for (const Frame& f : split.LastFrames()) {
