@@ -59,9 +59,6 @@ double DelayedExchange::KickEnergy(BodyId id, const BodyView& v) const {
   };
   const auto [begin, end] = kicks_.equal_range(id);
   for (auto it = begin; it != end; ++it) add(it->second);
-  for (const Input& i : h_.pending) {
-    if (i.body == id && i.kind != Input::Kind::kSpawn) add(i);
-  }
   return energy;
 }
 
@@ -73,28 +70,24 @@ void DelayedExchange::ForeignReach(std::vector<ReachNode>* nodes, Energies* ener
     n.id = f.id;
     n.box = f.box;
     n.source = f.source;
-    BodyId group = 0;
-    if (f.source == 0) {
-      const Shadow& s = shadows_.at(f.id);
-      n.mass = s.states.front().view.mass;
-      group = s.bound.group;
-    } else {
-      const Aura& a = remote_.at(h_.peers[static_cast<size_t>(f.source - 1)]).at(f.id);
-      n.mass = std::max(1e-9, static_cast<double>(a.mass));
-      group = a.group;
-    }
-    auto [it, fresh] = groups.emplace(std::tuple{f.source, f.owner, group}, 0);
-    if (fresh) it->second = energies->Add();
-    n.group = it->second;
+    const auto enter = [&](BodyId name) {
+      auto [it, fresh] = groups.emplace(std::tuple{f.source, f.owner, name}, 0);
+      if (fresh) it->second = energies->Add();
+      n.group = it->second;
+    };
     const auto raise = [&](int source, double joules) {
       energies->At(n.group, source) = std::max(energies->At(n.group, source), joules);
     };
     if (f.source == 0) {
       const Shadow& s = shadows_.at(f.id);
+      n.mass = s.states.front().view.mass;
+      enter(s.bound.group);
       for (size_t i = 0; i < s.bound.energies.size(); ++i) raise(static_cast<int>(i), s.bound.energies[i]);
       raise(0, s.states.front().view.energy);
     } else {
       const Aura& a = remote_.at(h_.peers[static_cast<size_t>(f.source - 1)]).at(f.id);
+      n.mass = std::max(1e-9, static_cast<double>(a.mass));
+      enter(a.group);
       raise(f.source, a.energy);
     }
     nodes->push_back(n);

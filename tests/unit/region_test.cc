@@ -157,6 +157,19 @@ TEST(Region, TieGoesToTheBetterRank) {
   }
 }
 
+TEST(Region, WhatHasHardlyLeftStaysWithItsOwner) {
+  World w = TwoColumns();
+  w.exchange.dwell = 0;
+  w.exchange.home_slack = 0.5;
+  w.bodies = {Ball(1, -1, 1)};
+  Lockstep s(w);
+  Tick n = 0;
+  while (n < 200 && s.Owner(1) == 0) s.RunTo(++n);
+  ASSERT_EQ(s.Owner(1), 1);
+  const BodyView v = s.region(1).engine().View(1);
+  EXPECT_NEAR(v.box.min.x(), 0.5, 0.05) << "it is all outside, by the slack";
+}
+
 TEST(Region, IslandStaysForItsDwell) {
   World w = Meeting(100);
   w.exchange.dwell = 40;
