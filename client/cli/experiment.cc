@@ -183,19 +183,9 @@ int RunExperiment(const ExperimentOptions& options) {
   } else if (!experiment.rows.empty()) {
     std::cout << TableText(experiment) << "Written to " << options.out << std::endl;
   }
-  if (absl::IsCancelled(status)) {
-    std::cerr << "aureole: interrupted\n";
-    return kExitInterrupted;
-  }
-  for (const absl::Status& s : {status, written}) {
-    if (s.ok()) continue;
-    std::cerr << "aureole: " << s.message() << '\n';
-    return kExitFailed;
-  }
   const bool exact =
       std::all_of(experiment.rows.begin(), experiment.rows.end(), [](const Row& r) { return r.Exact(); });
-  if (!exact) std::cerr << "aureole: not every split run was exact\n";
-  return exact ? kExitOk : kExitFailed;
+  return ExitCode(status, written, exact);
 }
 
 }  // namespace aureole

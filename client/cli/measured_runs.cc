@@ -8,6 +8,7 @@
 #include <absl/strings/str_cat.h>
 #include <absl/strings/str_format.h>
 
+#include "client/cli/exit_codes.h"
 #include "server/control/interrupts.h"
 #include "server/control/local_allocator.h"
 
@@ -71,6 +72,20 @@ absl::StatusOr<std::vector<RunMeasure>> MeasuredRuns(const std::string& name, co
     out.push_back(Measure(result, tick_us));
   }
   return out;
+}
+
+int ExitCode(const absl::Status& runs, const absl::Status& written, bool exact) {
+  if (absl::IsCancelled(runs)) {
+    std::cerr << "aureole: interrupted\n";
+    return kExitInterrupted;
+  }
+  for (const absl::Status& s : {runs, written}) {
+    if (s.ok()) continue;
+    std::cerr << "aureole: " << s.message() << '\n';
+    return kExitFailed;
+  }
+  if (!exact) std::cerr << "aureole: not every split run was exact\n";
+  return exact ? kExitOk : kExitFailed;
 }
 
 }  // namespace aureole

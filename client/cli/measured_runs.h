@@ -18,4 +18,8 @@ namespace aureole {
 absl::StatusOr<std::vector<RunMeasure>> MeasuredRuns(const std::string& name, const RunOptions& run, int64_t tick_us,
                                                      int repeat, const std::string& region_server);
 
+// What a command exits with after such runs: how they ended, how the results were written, and whether every split run
+// gave the answer of the undivided one. Says on stderr what went wrong.
+int ExitCode(const absl::Status& runs, const absl::Status& written, bool exact);
+
 }  // namespace aureole

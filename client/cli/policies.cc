@@ -117,17 +117,7 @@ int RunPolicies(const ExperimentOptions& options) {
   } else if (!table.scenes.empty()) {
     std::cout << TableText(table) << "Written to " << options.out << std::endl;
   }
-  if (absl::IsCancelled(status)) {
-    std::cerr << "aureole: interrupted\n";
-    return kExitInterrupted;
-  }
-  for (const absl::Status& s : {status, written}) {
-    if (s.ok()) continue;
-    std::cerr << "aureole: " << s.message() << '\n';
-    return kExitFailed;
-  }
-  if (!table.Exact()) std::cerr << "aureole: not every split run was exact\n";
-  return table.Exact() ? kExitOk : kExitFailed;
+  return ExitCode(status, written, table.Exact());
 }
 
 }  // namespace aureole
