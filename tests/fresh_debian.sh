@@ -69,7 +69,7 @@ remove_work() {
   local directory process
   [[ -z $child ]] || kill -KILL "$child" 2>/dev/null || true
   for process in /proc/[0-9]*; do
-    if [[ $(readlink "$process/root" 2>/dev/null) == "$work/root" ]]; then
+    if [[ $(readlink "$process/root" 2>/dev/null) == "$work/system" ]]; then
       kill -KILL "${process#/proc/}" 2>/dev/null || true
     fi
   done
@@ -94,20 +94,20 @@ as_root() {
   uri=$(mirror)
   [[ -n $uri ]] || fail "no source of Debian $suite in this machine's /etc/apt (has apt-get update been run?)"
   make_base
-  mkdir -p "$work/root"
-  tar -C "$work/root" -xzf "$base"
-  say "deb $uri $suite main" >"$work/root/etc/apt/sources.list"
-  cp -L /etc/resolv.conf /etc/hosts "$work/root/etc/"
+  mkdir -p "$work/system"
+  tar -C "$work/system" -xzf "$base"
+  say "deb $uri $suite main" >"$work/system/etc/apt/sources.list"
+  cp -L /etc/resolv.conf /etc/hosts "$work/system/etc/"
   apt-config dump --format '%f "%v";%n' Acquire::http::Proxy Acquire::https::Proxy \
-    >"$work/root/etc/apt/apt.conf.d/50proxy"
-  mkdir -p "$work/root/src"
-  git -c advice.detachedHead=false clone --quiet "$work/bundle" "$work/root/src/aureole"
-  say "fresh: Debian $(<"$work/root/etc/debian_version"), commit $(git -C "$work/root/src/aureole" log -1 --format=%h)"
+    >"$work/system/etc/apt/apt.conf.d/50proxy"
+  mkdir -p "$work/system/src"
+  git -c advice.detachedHead=false clone --quiet "$work/bundle" "$work/system/src/aureole"
+  say "fresh: Debian $(<"$work/system/etc/debian_version"), commit $(git -C "$work/system/src/aureole" log -1 --format=%h)"
 
   # In name spaces of its own nothing stays mounted and no process stays, even after a kill.
   local spaces=(unshare --mount --pid --fork --kill-child)
   "${spaces[@]}" true 2>/dev/null || spaces=()
-  "${spaces[@]}" "$self" --inside "$work/root" "$@" &
+  "${spaces[@]}" "$self" --inside "$work/system" "$@" &
   child=$!
   wait "$child" || status=$?
   child=
