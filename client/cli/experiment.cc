@@ -36,37 +36,57 @@ class Experimenter {
     experiment_.hash_every = kHashEvery;
   }
 
-  // Appends the row of one world, running its undivided reference first when nobody has.
-  absl::Status Add(const WorldFile& file) {
-    const int64_t tick_us = file.world.environment.tick_us;
-    const Tick last_tick = TicksIn(experiment_.duration_s, tick_us);
-    const std::string key = ContentKey(file.spec);
-    if (!references_.contains(key)) {
-      const absl::StatusOr<std::vector<RunMeasure>> runs = Repeat(file, true, last_tick);
-      if (!runs.ok()) return runs.status();
-      references_[key] = experiment_.references.size();
-      experiment_.references.push_back({file.world.name, MeanOf(*runs)});
+  // One run of each world, each content's undivided run before the first of its worlds. Rounds follow each other, so
+  // that a time in which the machine is slow falls on all worlds, and each run is compared with its own round's.
+  absl::Status RunRound(const std::vector<WorldFile>& files, int round) {
+    std::map<std::string, double> undivided;  // last maximum frame time of this round
+    for (size_t i = 0; i < files.size(); ++i) {
+      const WorldFile& file = files[i];
+      std::cerr << absl::StrFormat("[%d/%d] %s, %d regions\n", round * files.size() + i + 1,
+                                   options_.repeat * files.size(), file.path, file.world.layout.size());
+      const std::string key = ContentKey(file.spec);
+      if (!undivided.contains(key)) {
+        absl::StatusOr<RunMeasure> run = Run(file, true, round);
+        if (!run.ok()) return run.status();
+        undivided[key] = run->LastMaxFrameMs();
+        references_[key].push_back(*std::move(run));
+      }
+      Split& split = splits_[i];
+      split.file = &file;
+      split.key = key;
+      if (file.world.layout.size() == 1) continue;
+      absl::StatusOr<RunMeasure> run = Run(file, false, round);
+      if (!run.ok()) return run.status();
+      if (undivided[key] > 0) split.ratios.push_back(run->LastMaxFrameMs() / undivided[key]);
+      split.runs.push_back(*std::move(run));
     }
-    Row row;
-    row.world = file.world.name;
-    row.file = file.path;
-    row.figure = FigureOf(file.spec);
-    row.regions = file.world.layout.size();
-    row.exchange_delay = file.world.exchange.k;
-    row.reference = references_[key];
-    row.is_reference = row.regions == 1;
-    const RunMeasure& reference = experiment_.references[row.reference].measure;
-    if (row.is_reference) {
-      row.measure = reference;
-      row.comparison = Compare(row.measure, reference, last_tick);
-    } else {
-      const absl::StatusOr<std::vector<RunMeasure>> runs = Repeat(file, false, last_tick);
-      if (!runs.ok()) return runs.status();
-      row.measure = MeanOf(*runs);
-      row.comparison = CompareAll(*runs, reference, last_tick);
-    }
-    experiment_.rows.push_back(std::move(row));
     return absl::OkStatus();
+  }
+
+  // Of the rounds so far; worlds that have not run are left out.
+  void Summarise() {
+    std::map<std::string, size_t> places;
+    for (const auto& [index, split] : splits_) {
+      const WorldFile& file = *split.file;
+      const std::vector<RunMeasure>& undivided = references_.at(split.key);
+      const auto [place, fresh] = places.try_emplace(split.key, experiment_.references.size());
+      if (fresh) experiment_.references.push_back({file.world.name, MedianOf(undivided)});
+      Row row;
+      row.world = file.world.name;
+      row.file = file.path;
+      row.figure = FigureOf(file.spec);
+      row.regions = file.world.layout.size();
+      row.exchange_delay = file.world.exchange.k;
+      row.reference = place->second;
+      row.is_reference = row.regions == 1;
+      if (!row.is_reference && split.runs.empty()) continue;
+      const std::vector<RunMeasure>& runs = row.is_reference ? undivided : split.runs;
+      row.measure = MedianOf(runs);
+      row.ratios = split.ratios;
+      const Tick last_tick = TicksIn(experiment_.duration_s, file.world.environment.tick_us);
+      row.comparison = CompareAll(runs, undivided.front(), last_tick);
+      experiment_.rows.push_back(std::move(row));
+    }
   }
 
   const Experiment& experiment() const { return experiment_; }
@@ -76,21 +96,30 @@ class Experimenter {
     return spec.layout().has_columns() ? Figure::kColumns : Figure::kCorners;
   }
 
-  absl::StatusOr<std::vector<RunMeasure>> Repeat(const WorldFile& file, bool undivided, Tick last_tick) {
+  absl::StatusOr<RunMeasure> Run(const WorldFile& file, bool undivided, int round) {
     RunOptions run;
     run.world = file.spec;
     run.regions = file.world.layout.size();
     run.undivided = undivided;
     run.no_real_time = options_.no_real_time;
-    run.last_tick = last_tick;
+    run.last_tick = TicksIn(experiment_.duration_s, file.world.environment.tick_us);
     run.hash_every = kHashEvery;
-    return MeasuredRuns(absl::StrCat(file.world.name, undivided ? ", undivided" : ""), run,
-                        file.world.environment.tick_us, options_.repeat, options_.region_server);
+    std::string name = absl::StrCat(file.world.name, undivided ? ", undivided" : "");
+    if (options_.repeat > 1) absl::StrAppend(&name, ", ", round + 1, " of ", options_.repeat);
+    return MeasuredRun(name, run, file.world.environment.tick_us, options_.region_server);
   }
+
+  struct Split {
+    const WorldFile* file = nullptr;
+    std::string key;  // of its content
+    std::vector<RunMeasure> runs;
+    std::vector<double> ratios;
+  };
 
   const ExperimentOptions& options_;
   Experiment experiment_;
-  std::map<std::string, size_t> references_;  // by content
+  std::map<std::string, std::vector<RunMeasure>> references_;  // undivided runs, by content
+  std::map<size_t, Split> splits_;                             // by the file's place
 };
 
 absl::Status WriteAll(const Experiment& experiment, const std::filesystem::path& directory) {
@@ -126,7 +155,8 @@ CLI::App* AddExperiment(CLI::App& app, ExperimentOptions* o) {
       ->excludes(worlds);
   e->add_option("--seed", o->seed, "Instead of the worlds' own seeds");
   AddDuration(e, &o->duration_s, "Simulated time of each run; when not given 60s, with --policies 20s");
-  e->add_option("--repeat", o->repeat, "Runs of each world; frame times are their means")
+  e->add_option("--repeat", o->repeat,
+                "Rounds, each of one run of each world; frame times and ratios are their medians")
       ->capture_default_str()
       ->check(CLI::Range(1, 1000));
   e->add_flag("--no-real-time", o->no_real_time, "As fast as it can, not at the world's tick; --policies always does");
@@ -170,11 +200,8 @@ int RunExperiment(const ExperimentOptions& options) {
 
   Experimenter experimenter(options);
   absl::Status status;
-  for (size_t i = 0; i < files.size() && status.ok(); ++i) {
-    std::cerr << absl::StrFormat("[%d/%d] %s, %d regions\n", i + 1, files.size(), files[i].path,
-                                 files[i].world.layout.size());
-    status = experimenter.Add(files[i]);
-  }
+  for (int round = 0; round < options.repeat && status.ok(); ++round) status = experimenter.RunRound(files, round);
+  experimenter.Summarise();
   const Experiment& experiment = experimenter.experiment();
   // What is done is worth keeping, whatever ended the rest.
   const absl::Status written = experiment.rows.empty() ? absl::OkStatus() : WriteAll(experiment, options.out);

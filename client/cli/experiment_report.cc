@@ -72,6 +72,7 @@ Json RowJson(const Row& row, const Experiment& experiment) {
               {"wall_s", m.wall_seconds},
               {"last_max_frame_ms", m.LastMaxFrameMs()},
               {"ratio", row.Ratio(experiment.references[row.reference])},
+              {"ratios", row.ratios},
               {"ideal", row.Ideal()},
               {"aim", row.Aim()},
               {"windows", WindowsJson(m)},
@@ -117,6 +118,7 @@ Series Curve(const std::string& label, const RunMeasure& m) {
 }  // namespace
 
 double Row::Ratio(const Reference& to) const {
+  if (!ratios.empty()) return MedianOf(ratios);
   const double one = to.measure.LastMaxFrameMs();
   return one > 0 ? measure.LastMaxFrameMs() / one : 0;
 }

@@ -29,10 +29,12 @@ struct Row {
   size_t reference = 0;       // index
   bool is_reference = false;  // one region: the undivided run itself
   RunMeasure measure;
+  // In each round, of the last window's maximum frame time to that of the undivided run of the same round.
+  std::vector<double> ratios;
   Comparison comparison;
 
   double Ideal() const { return 1.0 / regions; }
-  // Of the last window's maximum frame time to the undivided run's.
+  // Their median; without rounds, the ratio of the medians.
   double Ratio(const Reference& to) const;
   // What we aim at: 1.5 / n for columns, 2 / n at corners; 1 for one region.
   double Aim() const;

@@ -130,35 +130,38 @@ RunMeasure Measure(const RunResult& result, int64_t tick_us) {
   return out;
 }
 
-RunMeasure MeanOf(std::span<const RunMeasure> repeats) {
+double MedianOf(std::vector<double> values) {
+  std::sort(values.begin(), values.end());
+  const size_t half = values.size() / 2;
+  return values.size() % 2 == 1 ? values[half] : (values[half - 1] + values[half]) / 2;
+}
+
+RunMeasure MedianOf(std::span<const RunMeasure> repeats) {
   RunMeasure out = repeats.front();
-  for (const RunMeasure& m : repeats.subspan(1)) {
+  for (const RunMeasure& m : repeats) {
     out.windows.resize(std::min(out.windows.size(), m.windows.size()));
-    for (size_t i = 0; i < out.windows.size(); ++i) {
-      WindowMeasure& w = out.windows[i];
-      const WindowMeasure& add = m.windows[i];
-      w.max_frame_ms += add.max_frame_ms;
-      w.mean_frame_ms += add.mean_frame_ms;
-      w.max_thread_ms += add.max_thread_ms;
-      w.mean_thread_ms += add.mean_thread_ms;
-      w.max_wall_ms += add.max_wall_ms;
-    }
-    for (size_t r = 0; r < out.regions.size() && r < m.regions.size(); ++r) {
-      out.regions[r].last_max_frame_ms += m.regions[r].last_max_frame_ms;
-      out.regions[r].mean_frame_ms += m.regions[r].mean_frame_ms;
-      out.regions[r].max_frame_ms += m.regions[r].max_frame_ms;
-    }
+    out.regions.resize(std::min(out.regions.size(), m.regions.size()));
     out.violations = std::max(out.violations, m.violations);
-    out.wall_seconds += m.wall_seconds;
   }
-  const double n = static_cast<double>(repeats.size());
-  for (WindowMeasure& w : out.windows) {
-    for (double* v : {&w.max_frame_ms, &w.mean_frame_ms, &w.max_thread_ms, &w.mean_thread_ms, &w.max_wall_ms}) *v /= n;
+  const auto median = [&](auto value) {
+    std::vector<double> values;
+    for (const RunMeasure& m : repeats) values.push_back(value(m));
+    return MedianOf(std::move(values));
+  };
+  for (size_t i = 0; i < out.windows.size(); ++i) {
+    for (double WindowMeasure::*field :
+         {&WindowMeasure::max_frame_ms, &WindowMeasure::mean_frame_ms, &WindowMeasure::max_thread_ms,
+          &WindowMeasure::mean_thread_ms, &WindowMeasure::max_wall_ms}) {
+      out.windows[i].*field = median([&](const RunMeasure& m) { return m.windows[i].*field; });
+    }
   }
-  for (RegionMeasure& r : out.regions) {
-    for (double* v : {&r.last_max_frame_ms, &r.mean_frame_ms, &r.max_frame_ms}) *v /= n;
+  for (size_t r = 0; r < out.regions.size(); ++r) {
+    for (double RegionMeasure::*field :
+         {&RegionMeasure::last_max_frame_ms, &RegionMeasure::mean_frame_ms, &RegionMeasure::max_frame_ms}) {
+      out.regions[r].*field = median([&](const RunMeasure& m) { return m.regions[r].*field; });
+    }
   }
-  out.wall_seconds /= n;
+  out.wall_seconds = median([](const RunMeasure& m) { return m.wall_seconds; });
   return out;
 }
 

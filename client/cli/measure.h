@@ -65,9 +65,12 @@ std::optional<SlackQuantiles> QuantilesOf(const std::vector<int64_t>& slack);
 
 RunMeasure Measure(const RunResult& result, int64_t tick_us);
 
-// Of repeats of one run: frame times are means; counts are the largest, as repeats of an exact run agree in them.
+// The middle value, or the mean of the two in the middle. Precondition: not empty.
+double MedianOf(std::vector<double> values);
+
+// Of repeats of one run: times are medians; counts are the largest, as repeats of an exact run agree in them.
 // Precondition: not empty.
-RunMeasure MeanOf(std::span<const RunMeasure> repeats);
+RunMeasure MedianOf(std::span<const RunMeasure> repeats);
 
 struct Comparison {
   bool hash_equal = false;    // at every tick of the undivided run, the last one of the run among them

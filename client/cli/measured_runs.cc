@@ -53,23 +53,30 @@ class Progress {
 
 }  // namespace
 
+absl::StatusOr<RunMeasure> MeasuredRun(const std::string& name, const RunOptions& run, int64_t tick_us,
+                                       const std::string& region_server) {
+  LocalAllocator allocator({region_server, "", false});
+  RunResult result;
+  Progress progress(name, run.last_tick, tick_us);
+  const absl::Status s = RunWorld(
+      run, allocator,
+      [&progress](const RunStatus& status) {
+        progress.Show(status);
+        return Interrupts() == 0;
+      },
+      &result);
+  if (!s.ok()) return absl::Status(s.code(), absl::StrCat(name, ": ", s.message()));
+  return Measure(result, tick_us);
+}
+
 absl::StatusOr<std::vector<RunMeasure>> MeasuredRuns(const std::string& name, const RunOptions& run, int64_t tick_us,
                                                      int repeat, const std::string& region_server) {
   std::vector<RunMeasure> out;
   for (int i = 0; i < repeat; ++i) {
     const std::string label = repeat > 1 ? absl::StrFormat("%s, %d of %d", name, i + 1, repeat) : name;
-    LocalAllocator allocator({region_server, "", false});
-    RunResult result;
-    Progress progress(label, run.last_tick, tick_us);
-    const absl::Status s = RunWorld(
-        run, allocator,
-        [&progress](const RunStatus& status) {
-          progress.Show(status);
-          return Interrupts() == 0;
-        },
-        &result);
-    if (!s.ok()) return absl::Status(s.code(), absl::StrCat(label, ": ", s.message()));
-    out.push_back(Measure(result, tick_us));
+    absl::StatusOr<RunMeasure> measured = MeasuredRun(label, run, tick_us, region_server);
+    if (!measured.ok()) return measured.status();
+    out.push_back(*std::move(measured));
   }
   return out;
 }

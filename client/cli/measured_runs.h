@@ -12,9 +12,11 @@
 
 namespace aureole {
 
-// `run`, `repeat` times (>= 1), one after the other. `name` is what progress and errors call it; `region_server` the
-// program to start, "" for aureole-region beside this one. Errors as of RunWorld; Cancelled after an interrupt, which
-// must be caught already (CatchInterrupts).
+// One run. `name` is what progress and errors call it; `region_server` the program to start, "" for aureole-region
+// beside this one. Errors as of RunWorld; Cancelled after an interrupt, which must be caught already (CatchInterrupts).
+absl::StatusOr<RunMeasure> MeasuredRun(const std::string& name, const RunOptions& run, int64_t tick_us,
+                                       const std::string& region_server);
+// `repeat` of them (>= 1), one after the other.
 absl::StatusOr<std::vector<RunMeasure>> MeasuredRuns(const std::string& name, const RunOptions& run, int64_t tick_us,
                                                      int repeat, const std::string& region_server);
 

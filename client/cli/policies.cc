@@ -58,11 +58,11 @@ class PolicyRuns {
     scene.density = crowd.density;
     scene.fast = crowd.fast;
     scene.ticks = crowd.ticks;
-    scene.reference = MeanOf(*one);
+    scene.reference = MedianOf(*one);
     for (const ExchangeChoice& exchange : kExchangeChoices) {
       const absl::StatusOr<std::vector<RunMeasure>> split = Run(WithExchange(world, exchange), exchange.Name(), false);
       if (!split.ok()) return split.status();
-      scene.runs.push_back({exchange, MeanOf(*split), CompareAll(*split, scene.reference, crowd.ticks)});
+      scene.runs.push_back({exchange, MedianOf(*split), CompareAll(*split, scene.reference, crowd.ticks)});
     }
     return absl::OkStatus();
   }

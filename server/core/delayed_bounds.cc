@@ -1,5 +1,6 @@
 // How far bodies may get within the horizon: by the speed tolerance, or by their energy (R12).
 #include <algorithm>
+#include <cmath>
 #include <map>
 #include <tuple>
 
@@ -17,10 +18,16 @@ void DelayedExchange::AnnounceKicks() {
     std::vector<Input> inputs;
     h_.AppendInputs(announced_ + 1, &inputs);
     for (const Input& i : inputs) {
-      if (i.kind == Input::Kind::kImpulse || i.kind == Input::Kind::kVelocity) kicks_.emplace(i.body, i);
+      if (i.kind == Input::Kind::kSpawn || i.kind == Input::Kind::kRemove) continue;
+      if (i.over_area()) {
+        area_kicks_.push_back(i);
+      } else {
+        kicks_.emplace(i.body, i);
+      }
     }
   }
   std::erase_if(kicks_, [this](const auto& e) { return e.second.tick <= h_.tick; });
+  std::erase_if(area_kicks_, [this](const Input& i) { return i.tick <= h_.tick; });
 }
 
 void DelayedExchange::SetBounds() {
@@ -46,20 +53,29 @@ void DelayedExchange::SetBounds() {
   ComputeReach();
 }
 
+// The root of twice the kinetic energy is a norm of the velocities, so that what inputs add to it adds up at most.
 double DelayedExchange::KickEnergy(BodyId id, const BodyView& v) const {
-  double speed = v.asleep ? 0 : v.velocity.norm(), energy = v.energy;
+  // No body of mass m inside a sphere of radius r has an inertia of more than m r^2.
+  const double most_inertia = v.mass * v.radius * v.radius;
+  double norm = std::sqrt(2 * v.energy);
   auto add = [&](const Input& i) {
-    if (i.kind == Input::Kind::kImpulse) speed += i.linear.norm() / v.mass;
-    if (i.kind == Input::Kind::kVelocity) speed = std::max(speed, i.linear.norm());
-    // No body of mass m inside a sphere of radius r has an inertia of more than m r^2.
-    const double spin =
-        i.kind == Input::Kind::kImpulse ? i.angular.norm() : i.angular.norm() * v.mass * v.radius * v.radius;
-    energy = std::max(energy, 0.5 * v.mass * speed * speed) +
-             (i.kind == Input::Kind::kVelocity ? 0.5 * spin * i.angular.norm() : 0);
+    const double linear = i.linear.norm() + std::abs(i.area.outward);
+    double angular = i.angular.norm();
+    if (i.kind == Input::Kind::kImpulse) {
+      if (i.frame != Input::Frame::kCentre) angular += linear * v.radius;
+      norm += linear / std::sqrt(v.mass) + angular / std::sqrt(v.least_inertia);
+    } else {
+      const double kick = std::sqrt(v.mass * linear * linear + most_inertia * angular * angular);
+      norm = i.kind == Input::Kind::kVelocity ? std::max(norm, kick) : norm + kick;
+    }
   };
   const auto [begin, end] = kicks_.equal_range(id);
   for (auto it = begin; it != end; ++it) add(it->second);
-  return energy;
+  for (const Input& i : area_kicks_) {
+    const double way = static_cast<double>(i.tick - h_.tick) * step_;
+    if ((v.centre - i.area.centre).norm() <= i.area.radius + way) add(i);
+  }
+  return norm * norm / 2;
 }
 
 // What is foreign, with the energies of its groups, in the states that are known of it.

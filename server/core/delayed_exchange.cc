@@ -3,6 +3,7 @@
 
 #include <algorithm>
 
+#include "server/core/apply_input.h"
 #include "server/core/check.h"
 
 namespace aureole {
@@ -86,7 +87,7 @@ void DelayedExchange::Begin() {
   std::vector<Input> inputs;
   h_.AppendInputs(now(), &inputs);
   h_.live.ForgetBefore(now() + 1);
-  // Scripted spawns have been announced; their owner holds them as pending.
+  // Spawns have been announced; their owner holds them as pending.
   std::erase_if(inputs, [](const Input& i) { return i.kind == Input::Kind::kSpawn; });
   const auto due =
       std::find_if(h_.pending.begin(), h_.pending.end(), [this](const Input& i) { return i.tick > now(); });
@@ -95,7 +96,7 @@ void DelayedExchange::Begin() {
   std::sort(inputs.begin(), inputs.end());
   for (const Input& i : inputs) {
     if (i.kind == Input::Kind::kSpawn) waiting_.erase(i.body);
-    h_.ApplyInput(i);
+    h_.Apply(i);
   }
 }
 
@@ -109,10 +110,12 @@ void DelayedExchange::HearInputs(Tick n) {
   // Whoever sends a cluster knows what acts on it in flight when that was heard before: 2k ticks. `reach` also shows k
   // ticks ahead what may act within its horizon.
   const Tick effect = n + 2 * k_ + (reach_ ? margins_.horizon + 1 : 0);
-  for (const Graph& g : said) h_.live.Deliver(g.inputs, effect, g.of == h_.self);
+  // A spawn is announced as early as one of the script: at the end of this tick.
+  const Tick spawn_effect = now() + margins_.spawn_notice;
+  for (const Graph& g : said) h_.live.Deliver(g.inputs, effect, spawn_effect, g.of == h_.self);
 }
 
-void DelayedExchange::Apply(const Frame& f, RegionId peer) {
+void DelayedExchange::Apply(Frame f, RegionId peer) {
   said_[f.tick].insert(said_[f.tick].end(), f.graphs.begin(), f.graphs.end());
   auto& auras = remote_[peer];
   for (BodyId id : f.gone) auras.erase(id);
@@ -120,13 +123,25 @@ void DelayedExchange::Apply(const Frame& f, RegionId peer) {
   auto& away = away_[peer];
   for (BodyId id : f.away_gone) away.erase(id);
   for (const Away& a : f.away) away[a.id] = a;
-  for (const Transfer& t : f.transfers) {
+  for (Transfer& t : f.transfers) {
+    FindLiveSpawns(&t);
     h_.Arrive(t, peer, now());
     for (const Input& i : t.pending) {
       if (i.kind == Input::Kind::kSpawn) waiting_[i.body] = ViewOf(*i.spawn);
     }
     for (BodyId id : t.ids) shadows_.erase(id);
     CheckArrival(t);
+  }
+}
+
+// Every region heard of it before its owner could send it on.
+void DelayedExchange::FindLiveSpawns(Transfer* t) const {
+  for (Input& i : t->pending) {
+    if (i.spawn != nullptr) continue;
+    const Input* spawn = h_.live.due().FindSpawn(i.tick, i.body);
+    AUREOLE_CHECK(spawn != nullptr, "region %d was sent body %llu, which no client spawns at tick %lld", h_.self,
+                  static_cast<unsigned long long>(i.body), static_cast<long long>(i.tick));
+    i = *spawn;
   }
 }
 
@@ -160,6 +175,7 @@ BodyView DelayedExchange::ViewOf(const BodySpec& spec) const {
 void DelayedExchange::AnnounceSpawns() {
   std::vector<Input> inputs;
   ScriptedInputs(h_.world, h_.tick + margins_.spawn_notice, &inputs);
+  h_.live.due().AppendDue(h_.tick + margins_.spawn_notice, &inputs);
   for (Input& i : inputs) {
     if (i.kind != Input::Kind::kSpawn || h_.world.layout.Home(i.spawn->position) != h_.self) continue;
     i.body = i.spawn->id;
@@ -231,9 +247,8 @@ void DelayedExchange::FastForward(Transfer* t) {
     t->pending.erase(t->pending.begin(), due);
     std::sort(inputs.begin(), inputs.end());
     for (const Input& i : inputs) {
-      if (i.kind != Input::Kind::kSpawn && !scratch_->Contains(i.body)) continue;
-      scratch_->Apply(i);
-      if (i.source != 0) h_.live.Applied(i);
+      const int64_t bodies = ApplyInput(i, scratch_.get());
+      if (i.source != 0) h_.live.Applied(i, bodies);
     }
     for (BodyId id : t->ids) {
       Shadow::State& s = shadows_.at(id).states.back();

@@ -85,7 +85,8 @@ class DelayedExchange final : public Protocol {
   // What all regions said in the frames of tick n.
   void HearInputs(Tick n);
 
-  void Apply(const Frame& f, RegionId peer);
+  void Apply(Frame f, RegionId peer);
+  void FindLiveSpawns(Transfer* t) const;
 
   // A broken horizon: an arrival overlapped an owned body already one step ago, when the two were stepped apart.
   void CheckArrival(const Transfer& t);
@@ -208,7 +209,8 @@ class DelayedExchange final : public Protocol {
   Bound same_;                                   // of every body, in the `tolerance` policy
   absl::flat_hash_map<BodyId, Bound> bounds_;    // of own bodies, in the `reach` policy
   double most_push_ = 0, most_give_ = 0;         // over own bodies
-  std::multimap<BodyId, Input> kicks_;           // scripted impulses that are announced
+  std::multimap<BodyId, Input> kicks_;           // impulses that are announced
+  std::vector<Input> area_kicks_;                // the same, over areas
   Tick announced_ = 0;                           // up to this tick
   std::vector<BodyId> near_;
   std::map<RegionId, std::vector<Transfer>> leaving_;

@@ -42,12 +42,13 @@ struct Rect {
 // What the protocol knows of one body.
 struct BodyView {
   BodyId id = 0;
-  Box box;            // the exact box that the next Step's contact filter uses (breaking margin included)
-  Vec3 centre;        // centre of mass
-  double radius = 0;  // of the sphere about `centre` that bounds `box` in every orientation of the body
-  Vec3 velocity;      // m/s
-  double mass = 0;    // kg
-  double energy = 0;  // kinetic, of turning too, J; 0 when asleep
+  Box box;                   // the exact box that the next Step's contact filter uses (breaking margin included)
+  Vec3 centre;               // centre of mass
+  double radius = 0;         // of the sphere about `centre` that bounds `box` in every orientation of the body
+  Vec3 velocity;             // m/s
+  double mass = 0;           // kg
+  double least_inertia = 0;  // the smallest principal moment, kg m^2
+  double energy = 0;         // kinetic, of turning too, J; 0 when asleep
   bool asleep = false;
 };
 

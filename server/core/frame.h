@@ -56,6 +56,13 @@ struct LateAura {
   Aura aura;
 };
 
+// An input of a client that a region has applied, and to how many of its bodies.
+struct AppliedInput {
+  InputName name;
+  int64_t bodies = 0;
+  friend bool operator==(const AppliedInput&, const AppliedInput&) = default;
+};
+
 // What a region says to all in each tick: k = 0 by R16; k >= 1 the last two only. Nothing to say: it is not passed on.
 struct Graph {
   RegionId of = kNoRegion;
@@ -66,7 +73,7 @@ struct Graph {
   std::vector<RegionId> opened, closed;
   // Inputs of clients offered to `of`, in the order in which they came; and those that `of` has applied.
   std::vector<Input> inputs;
-  std::vector<InputName> applied;
+  std::vector<AppliedInput> applied;
   bool empty() const {
     return edges.empty() && fragments.empty() && late.empty() && opened.empty() && closed.empty() && inputs.empty() &&
            applied.empty();

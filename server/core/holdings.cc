@@ -5,6 +5,7 @@
 
 #include <absl/strings/str_cat.h>
 
+#include "server/core/apply_input.h"
 #include "server/core/check.h"
 
 namespace aureole {
@@ -158,20 +159,15 @@ void Holdings::LoadInitialState(double margin) {
 void Holdings::AppendInputs(Tick n, std::vector<Input>* out) const {
   const auto begin = static_cast<std::ptrdiff_t>(out->size());
   ScriptedInputs(world, n, out);
-  live.AppendDue(n, out);
+  live.due().AppendDue(n, out);
   std::sort(out->begin() + begin, out->end());
 }
 
-void Holdings::ApplyInput(const Input& input) {
-  if (input.kind == Input::Kind::kSpawn) {
-    held.try_emplace(input.spawn->id);
-    engine->Apply(input);
-    return;
-  }
-  if (!engine->Contains(input.body)) return;
-  engine->Apply(input);
-  if (input.kind == Input::Kind::kRemove) held.erase(input.body);
-  if (input.source != 0) live.Applied(input);
+void Holdings::Apply(const Input& input) {
+  const int64_t bodies = ApplyInput(input, engine.get());
+  if (input.kind == Input::Kind::kSpawn) held.try_emplace(input.spawn->id);
+  if (input.kind == Input::Kind::kRemove && bodies > 0) held.erase(input.body);
+  if (input.source != 0) live.Applied(input, bodies);
 }
 
 Transfer Holdings::Depart(std::vector<BodyId> ids, TransferCause cause) {

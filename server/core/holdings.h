@@ -63,8 +63,8 @@ struct Holdings {
   // Every input that takes effect at the start of tick n, of the script and of clients, in Input's order, appended. The
   // same in all regions; it is for the region that holds the body, or is the home of the spawn, to apply it.
   void AppendInputs(Tick n, std::vector<Input>* out) const;
-  // Applies it when its body is here; a spawn always.
-  void ApplyInput(const Input& input);
+  // Applies it to what it means of the bodies here; a spawn always.
+  void Apply(const Input& input);
   // Extracts a closed set of owned bodies for a new owner.
   Transfer Depart(std::vector<BodyId> ids, TransferCause cause);
   // Takes over what a peer sent.

@@ -26,6 +26,8 @@ inline constexpr Range kSpeedTolerance{1e-3, 1e4, "m/s"};
 inline constexpr Range kSpin{0, 1e3, "rad/s"};
 inline constexpr Range kAcceleration{0, 1e3, "m/s^2"};
 inline constexpr Range kImpulse{0, 1e12, "N s"};
+inline constexpr Range kForce{0, 1e12, "N"};
+inline constexpr Range kInputRate{1, 1e6, "inputs/s"};
 inline constexpr Range kFriction{0, 10, ""};
 inline constexpr Range kShare{0, 1, ""};  // restitution, damping
 inline constexpr Range kWeight{0, 1e9, ""};

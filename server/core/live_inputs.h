@@ -14,6 +14,8 @@
 
 #include <absl/status/status.h>
 
+#include "server/core/frame.h"
+#include "server/core/input_schedule.h"
 #include "server/core/scene.h"
 
 namespace aureole {
@@ -21,11 +23,21 @@ namespace aureole {
 // What became of an input that was offered here.
 struct InputOutcome {
   InputName name;
-  Tick tick = 0;         // at whose start it took effect, or would have
-  bool applied = false;  // false: no region had its body then
+  Tick tick = 0;       // at whose start it took effect, or would have; 0: no longer known
+  int64_t bodies = 0;  // on which it acted, in its first tick; 0: what it named was nowhere then
+  BodyId body = 0;     // a spawn's
+
+  bool applied() const { return bodies > 0; }
+  friend bool operator==(const InputOutcome&, const InputOutcome&) = default;
 };
 
-// InvalidArgument when it is no impulse, velocity or removal of a client, or is not finite.
+// Bodies that clients spawn have ids from here on, in the order in which they are told.
+inline constexpr BodyId kFirstLiveId = uint64_t{1} << 61;
+inline bool IsLiveId(BodyId id) { return id >= kFirstLiveId && id < 2 * kFirstLiveId; }
+// A force lasts at most so long.
+inline constexpr Tick kMostInputTicks = 100'000;
+
+// InvalidArgument when it cannot be an input of a client: not finite, without a target, no valid kind.
 absl::Status CheckLiveInput(const Input& input);
 
 class LiveInputs {
@@ -42,20 +54,19 @@ class LiveInputs {
 
   // At most kMostPerTick of what was offered, in order, to be told to all.
   std::vector<Input> TakeOffered();
-  // What a region told; it takes effect at tick `effect`. Called alike in every region: same order, same tick. `mine`:
-  // this region told it.
-  void Deliver(const std::vector<Input>& inputs, Tick effect, bool mine);
-  // Inputs that take effect at tick n, appended.
-  void AppendDue(Tick n, std::vector<Input>* out) const;
+  // What a region told; it takes effect at tick `effect`, a spawn at tick `spawn_effect`. Called alike in every region:
+  // same order, same ticks. `mine`: this region told it.
+  void Deliver(const std::vector<Input>& inputs, Tick effect, Tick spawn_effect, bool mine);
+  const InputSchedule& due() const { return due_; }
   // Forgets inputs of ticks before n.
-  void ForgetBefore(Tick n) { due_.erase(due_.begin(), due_.lower_bound(n)); }
+  void ForgetBefore(Tick n) { due_.ForgetBefore(n); }
 
-  // This region has applied it.
-  void Applied(const Input& input) { applied_.emplace_back(input.source, input.sequence); }
+  // This region has applied it to so many bodies.
+  void Applied(const Input& input, int64_t bodies);
   // What was applied here since the last call, to be told to all.
-  std::vector<InputName> TakeApplied() { return std::exchange(applied_, {}); }
+  std::vector<AppliedInput> TakeApplied() { return std::exchange(applied_, {}); }
   // A region, this one too, has applied these.
-  void Heard(const std::vector<InputName>& applied);
+  void Heard(const std::vector<AppliedInput>& applied);
   // All regions have been heard about inputs up to this tick.
   void Settle(Tick n);
 
@@ -70,7 +81,9 @@ class LiveInputs {
     std::deque<InputOutcome> recent;
   };
   struct Open {
-    bool applied = false;
+    int64_t bodies = 0;
+    bool over_area = false;
+    BodyId spawned = 0;
     int mine = 0;  // how often it was offered here
   };
 
@@ -78,11 +91,12 @@ class LiveInputs {
   void ForgetOutcomes(Tick n);
 
   std::deque<Input> offered_;
-  std::map<Tick, std::vector<Input>> due_;
+  InputSchedule due_;
+  BodyId next_body_ = kFirstLiveId;
   std::map<std::pair<Tick, InputName>, Open> open_;  // not settled
   std::map<InputName, Tick> effect_;                 // of these
   std::map<uint64_t, Source> sources_;
-  std::vector<InputName> applied_;
+  std::vector<AppliedInput> applied_;
   std::vector<InputOutcome> outcomes_;
   std::vector<Input> delivered_;
 };

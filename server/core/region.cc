@@ -42,9 +42,9 @@ absl::Status CheckRegions(const Graph& g, int regions) {
   return absl::OkStatus();
 }
 
-// A spawn of the script travels by its name.
+// A spawn travels by its name: one of the script is found there, one of a client when the frame is applied.
 absl::Status FindSpawn(const World& world, Input* spawn) {
-  if (spawn->spawn != nullptr) return absl::OkStatus();
+  if (spawn->spawn != nullptr || IsLiveId(spawn->body)) return absl::OkStatus();
   std::vector<Input> script;
   ScriptedInputs(world, spawn->tick, &script);
   for (const Input& i : script) {

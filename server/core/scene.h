@@ -99,23 +99,48 @@ struct JointSpec {
   bool collide = false;  // do the two bodies collide with each other
 };
 
+// The dynamic bodies whose centre of mass lies in a closed sphere.
+struct Area {
+  Vec3 centre = Vec3::Zero();
+  double radius = 0;  // m; 0: no area
+  // Added to the linear part of each body's input: so much away from the centre, or towards it. Nothing for a body at
+  // the centre.
+  double outward = 0;
+  bool fades = false;  // `outward` falls off linearly, to 0 at the radius
+};
+
 // What changes a running world. Takes effect at the start of a tick, before its exchange and step (PROTOCOL.md R13);
 // inputs of one tick apply in (source, sequence) order.
 struct Input {
   enum class Kind : uint8_t {
-    kSpawn = 1,     // `spawn`
-    kRemove = 2,    // `body`; what touched it wakes (P59)
-    kImpulse = 3,   // `linear` N s at the centre of mass and `angular` N m s, on `body`; wakes it
-    kVelocity = 4,  // sets both velocities of `body`; wakes it
+    kSpawn = 1,           // `spawn`
+    kRemove = 2,          // `body`; what touched it wakes (P59)
+    kImpulse = 3,         // `linear` N s at `point` and `angular` N m s; wakes
+    kVelocity = 4,        // sets both velocities; wakes
+    kVelocityChange = 5,  // adds to both velocities; wakes
+  };
+  // Of the point where a linear impulse acts.
+  enum class Frame : uint8_t {
+    kCentre = 0,  // no point: the centre of mass
+    kWorld = 1,
+    kBody = 2,  // turns with the body; the centre of mass is its origin
   };
   Tick tick = 0;
   uint64_t source = 0;    // 0: the world's script; else a client
-  uint64_t sequence = 0;  // grows by one per source
+  uint64_t sequence = 0;  // grows with every input of a source
   Kind kind = Kind::kImpulse;
-  BodyId body = 0;
+  BodyId body = 0;  // of a spawn: that of `spawn`
+  Area area;        // of a client's impulse or change of velocity: instead of `body`
   Vec3 linear = Vec3::Zero();
   Vec3 angular = Vec3::Zero();
+  Frame frame = Frame::kCentre;
+  Vec3 point = Vec3::Zero();  // m
+  // A client's impulse acts at the start of so many ticks in a row, which is a force; the first is `tick`.
+  Tick ticks = 1;
+  bool again = false;  // this is not the first of them
   std::shared_ptr<const BodySpec> spawn;
+
+  bool over_area() const { return area.radius > 0; }
 
   friend bool operator<(const Input& x, const Input& y) {
     if (x.tick != y.tick) return x.tick < y.tick;

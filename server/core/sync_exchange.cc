@@ -144,7 +144,7 @@ class SyncExchange final : public Protocol {
     h_.live.ForgetBefore(now() + 1);
     for (const Input& i : inputs_) {
       const bool elsewhere = i.kind == Input::Kind::kSpawn && h_.world.layout.Home(i.spawn->position) != h_.self;
-      if (!elsewhere) h_.ApplyInput(i);
+      if (!elsewhere) h_.Apply(i);
     }
     near_.clear();
     h_.engine->CollectOutside(h_.rect, kOpenAhead, &near_);
@@ -408,7 +408,7 @@ class SyncExchange final : public Protocol {
   void HearInputs() {
     for (const Graph& g : graphs_) h_.live.Heard(g.applied);
     h_.live.Settle(now());
-    for (const Graph& g : graphs_) h_.live.Deliver(g.inputs, now() + 1, g.of == h_.self);
+    for (const Graph& g : graphs_) h_.live.Deliver(g.inputs, now() + 1, now() + 1, g.of == h_.self);
   }
 
   // Both ends read the same graphs, so both change at the same tick.

@@ -108,7 +108,8 @@ class ToyEngine final : public Engine {
       return;
     }
     for (int i = 0; i < 3; ++i) {
-      b.velocity[i] = in.kind == Input::Kind::kVelocity ? in.linear[i] : b.velocity[i] + in.linear[i] / b.mass;
+      const double mass = in.kind == Input::Kind::kImpulse ? b.mass : 1;
+      b.velocity[i] = in.kind == Input::Kind::kVelocity ? in.linear[i] : b.velocity[i] + in.linear[i] / mass;
     }
     Wake(b);
     Clamp(b);
@@ -144,6 +145,7 @@ class ToyEngine final : public Engine {
     v.radius = std::max({b.half[0], b.half[1], b.half[2]});
     v.velocity = ToVec(b.velocity);
     v.mass = b.mass;
+    v.least_inertia = b.mass;  // it does not turn
     v.energy = b.asleep != 0 ? 0 : 0.5 * b.mass * v.velocity.squaredNorm();
     v.asleep = b.asleep != 0;
     return v;

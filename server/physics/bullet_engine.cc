@@ -15,6 +15,19 @@ namespace {
 constexpr int kPool = 4096;        // manifolds of a region
 constexpr int kScratchPool = 128;  // of a cluster on its own
 
+// From the centre of mass to where the impulse acts, in the world's frame.
+btVector3 Lever(const Input& input, const btRigidBody& rigid) {
+  switch (input.frame) {
+    case Input::Frame::kCentre:
+      break;
+    case Input::Frame::kWorld:
+      return ToBullet(input.point) - rigid.getWorldTransform().getOrigin();
+    case Input::Frame::kBody:
+      return rigid.getWorldTransform().getBasis() * ToBullet(input.point);
+  }
+  return btVector3(0, 0, 0);
+}
+
 class BulletEngine : public Engine {
  public:
   BulletEngine(std::shared_ptr<Surroundings> surroundings, int pool) : world_(std::move(surroundings), pool) {}
@@ -65,18 +78,27 @@ void BulletEngine::Apply(const Input& input) {
     return;
   }
   Body* body = Get(input.body);
+  const btRigidBody& rigid = body->rigid;
   const btVector3 linear = ToBullet(input.linear), angular = ToBullet(input.angular);
   switch (input.kind) {
+    case Input::Kind::kSpawn:
+      break;
     case Input::Kind::kRemove:
       world_.WakeNeighbours(body);
       world_.Remove(body);
       break;
-    case Input::Kind::kImpulse:
-      world_.SetVelocities(body, body->rigid.getLinearVelocity() + linear * body->rigid.getInvMass(),
-                           body->rigid.getAngularVelocity() + body->rigid.getInvInertiaTensorWorld() * angular);
+    case Input::Kind::kImpulse: {
+      const btVector3 moment = angular + Lever(input, rigid).cross(linear);
+      world_.SetVelocities(body, rigid.getLinearVelocity() + linear * rigid.getInvMass(),
+                           rigid.getAngularVelocity() + rigid.getInvInertiaTensorWorld() * moment);
       break;
-    default:
+    }
+    case Input::Kind::kVelocity:
       world_.SetVelocities(body, linear, angular);
+      break;
+    case Input::Kind::kVelocityChange:
+      world_.SetVelocities(body, rigid.getLinearVelocity() + linear, rigid.getAngularVelocity() + angular);
+      break;
   }
 }
 
@@ -89,6 +111,8 @@ BodyView BulletEngine::View(BodyId id) const {
   view.radius = world_.Radius(body);
   view.velocity = FromBullet(body.rigid.getLinearVelocity());
   view.mass = body.mass;
+  const btVector3 inertia = body.rigid.getLocalInertia();
+  view.least_inertia = inertia[inertia.minAxis()];
   view.asleep = body.asleep;
   if (!body.asleep) {
     const btVector3 turning = body.rigid.getAngularVelocity() * body.rigid.getWorldTransform().getBasis();

@@ -113,8 +113,8 @@ TickLoop::Hooks Process::Hooks() {
   hooks.after_tick = [this](const FrameSample& sample) {
     if (metrics != nullptr) metrics->AddTick(sample);
   };
-  hooks.inputs = [this] { return simulation.impulses().Take(); };
-  hooks.outcomes = [this](const std::vector<InputOutcome>& outcomes) { simulation.impulses().Settle(outcomes); };
+  hooks.inputs = [this] { return simulation.inputs().Take(); };
+  hooks.outcomes = [this](const std::vector<InputOutcome>& outcomes) { simulation.inputs().Settle(outcomes); };
   hooks.publish = [this](const Region& region, int64_t bodies) { simulation.Publish(region, bodies); };
   hooks.report = [this](const v1::Report& report) {
     if (metrics != nullptr) {

@@ -7,7 +7,10 @@
 
 #include "aureole/v1/peer.pb.h"
 #include "server/core/check.h"
+#include "server/core/limits.h"
+#include "server/transport/input_codec.h"
 #include "server/transport/link_limits.h"
+#include "server/transport/return_if_error.h"
 
 namespace aureole {
 namespace {
@@ -67,16 +70,6 @@ void EncodeFragment(const Fragment& f, v1::Frame::Fragment* out) {
   out->set_gives_back(static_cast<uint32_t>(f.gives_back + 1));
 }
 
-void EncodeInput(const Input& input, v1::Frame::Input* out) {
-  out->set_source(input.source);
-  out->set_sequence(input.sequence);
-  out->set_kind(static_cast<uint32_t>(input.kind));
-  out->set_body(input.body);
-  if (input.kind == Input::Kind::kRemove) return;
-  out->mutable_linear()->Add(input.linear.data(), input.linear.data() + 3);
-  out->mutable_angular()->Add(input.angular.data(), input.angular.data() + 3);
-}
-
 void EncodeGraph(const Graph& g, v1::Frame::Graph* out) {
   out->set_of(static_cast<uint32_t>(g.of));
   IdWriter edges(out->mutable_edge_a());
@@ -94,9 +87,10 @@ void EncodeGraph(const Graph& g, v1::Frame::Graph* out) {
   for (RegionId r : g.opened) out->add_opened(static_cast<uint32_t>(r));
   for (RegionId r : g.closed) out->add_closed(static_cast<uint32_t>(r));
   for (const Input& i : g.inputs) EncodeInput(i, out->add_input());
-  for (const auto& [source, sequence] : g.applied) {
-    out->add_applied_source(source);
-    out->add_applied_sequence(sequence);
+  for (const AppliedInput& a : g.applied) {
+    out->add_applied_source(a.name.first);
+    out->add_applied_sequence(a.name.second);
+    out->add_applied_bodies(static_cast<uint64_t>(a.bodies));
   }
 }
 
@@ -129,11 +123,6 @@ void EncodeTransfer(const Transfer& t, v1::Frame::Transfer* out) {
 absl::Status Bad(const char* field, const std::string& what) {
   return absl::InvalidArgumentError(absl::StrCat("frame.", field, ": ", what));
 }
-
-#define AUREOLE_RETURN_IF_ERROR(expression)               \
-  do {                                                    \
-    if (absl::Status s = (expression); !s.ok()) return s; \
-  } while (false)
 
 absl::Status CheckCount(const char* field, int count, size_t limit) {
   if (static_cast<size_t>(count) > limit) {
@@ -269,30 +258,6 @@ absl::Status DecodeRegions(const char* field, const google::protobuf::RepeatedFi
   return absl::OkStatus();
 }
 
-absl::Status DecodeVector(const char* field, const Doubles& in, Vec3* out) {
-  AUREOLE_RETURN_IF_ERROR(CheckColumn(field, in.size(), 3, 1, false));
-  *out = Vec3(in.Get(0), in.Get(1), in.Get(2));
-  if (!out->allFinite()) return Bad(field, "is not finite");
-  return absl::OkStatus();
-}
-
-absl::Status DecodeInput(const v1::Frame::Input& in, Input* out) {
-  if (in.kind() < static_cast<uint32_t>(Input::Kind::kRemove) ||
-      in.kind() > static_cast<uint32_t>(Input::Kind::kVelocity)) {
-    return Bad("graph.input.kind", absl::StrCat("no input of kind ", in.kind(), " is told"));
-  }
-  if (in.source() == 0 || in.sequence() == 0 || in.body() == 0) {
-    return Bad("graph.input", "has no source, sequence or body");
-  }
-  out->source = in.source();
-  out->sequence = in.sequence();
-  out->kind = static_cast<Input::Kind>(in.kind());
-  out->body = in.body();
-  if (out->kind == Input::Kind::kRemove && in.linear().empty() && in.angular().empty()) return absl::OkStatus();
-  AUREOLE_RETURN_IF_ERROR(DecodeVector("graph.input.linear", in.linear(), &out->linear));
-  return DecodeVector("graph.input.angular", in.angular(), &out->angular);
-}
-
 absl::Status DecodeGraph(const v1::Frame::Graph& in, Graph* out) {
   AUREOLE_RETURN_IF_ERROR(DecodeKnownRegion("graph.of", in.of(), &out->of));
   AUREOLE_RETURN_IF_ERROR(DecodeEdges(in, &out->edges));
@@ -306,12 +271,22 @@ absl::Status DecodeGraph(const v1::Frame::Graph& in, Graph* out) {
   AUREOLE_RETURN_IF_ERROR(DecodeRegions("graph.closed", in.closed(), &out->closed));
   AUREOLE_RETURN_IF_ERROR(CheckCount("graph.input", in.input_size(), kMaxInputs));
   out->inputs.resize(in.input_size());
-  for (int i = 0; i < in.input_size(); ++i) AUREOLE_RETURN_IF_ERROR(DecodeInput(in.input(i), &out->inputs[i]));
+  for (int i = 0; i < in.input_size(); ++i) {
+    if (absl::Status s = DecodeInput(in.input(i), &out->inputs[i]); !s.ok()) {
+      return absl::InvalidArgumentError(absl::StrCat("frame.graph.", std::string(s.message())));
+    }
+  }
   AUREOLE_RETURN_IF_ERROR(CheckCount("graph.applied_source", in.applied_source_size(), kMaxApplied));
   AUREOLE_RETURN_IF_ERROR(
       CheckColumn("graph.applied_sequence", in.applied_sequence_size(), 1, in.applied_source_size(), false));
+  AUREOLE_RETURN_IF_ERROR(
+      CheckColumn("graph.applied_bodies", in.applied_bodies_size(), 1, in.applied_source_size(), false));
   for (int i = 0; i < in.applied_source_size(); ++i) {
-    out->applied.emplace_back(in.applied_source(i), in.applied_sequence(i));
+    if (in.applied_bodies(i) == 0 || in.applied_bodies(i) > static_cast<uint64_t>(limits::kMaxBodies)) {
+      return Bad("graph.applied_bodies", absl::StrCat("no input acts on ", in.applied_bodies(i), " bodies"));
+    }
+    out->applied.push_back(
+        {{in.applied_source(i), in.applied_sequence(i)}, static_cast<int64_t>(in.applied_bodies(i))});
   }
   return absl::OkStatus();
 }
@@ -351,7 +326,6 @@ bool AnyUnknownFields(const v1::Frame& frame) {
   for (const auto& g : frame.graph()) {
     any |= HasUnknownFields(g);
     for (const auto& f : g.fragment()) any |= HasUnknownFields(f);
-    for (const auto& i : g.input()) any |= HasUnknownFields(i);
   }
   for (const auto& t : frame.transfer()) any |= HasUnknownFields(t);
   return any;

@@ -6,6 +6,8 @@
 #include <utility>
 #include <vector>
 
+#include "server/transport/error_status.h"
+
 namespace aureole {
 namespace {
 
@@ -165,7 +167,7 @@ grpc::ServerUnaryReactor* SimulationService::GetWorld(grpc::CallbackServerContex
   grpc::ServerUnaryReactor* reactor = context->DefaultReactor();
   const std::lock_guard lock(mutex_);
   if (!serving_) {
-    reactor->Finish({grpc::StatusCode::UNAVAILABLE, "this server has no region at present"});
+    reactor->Finish(NoRegion());
     return reactor;
   }
   *response = world_;
@@ -184,21 +186,33 @@ grpc::ServerWriteReactor<v1::Replicas>* SimulationService::StreamReplicas(grpc::
   watchers_.insert(watcher);
   ++watching_;
   if (!sane) {
-    watcher->End(
-        {grpc::StatusCode::INVALID_ARGUMENT, "rate: must be above 0 and at most 1000 per second, or 0 for 20"});
+    watcher->End(Refusal(grpc::StatusCode::INVALID_ARGUMENT, v1::BAD_VALUE, "rate",
+                         "must be above 0 and at most 1000 per second, or 0 for 20"));
   } else if (!serving_) {
-    watcher->End({grpc::StatusCode::UNAVAILABLE, "this server has no region at present"});
+    watcher->End(NoRegion());
   }
   return watcher;
 }
 
 grpc::ServerReadReactor<v1::ImpulseBatch>* SimulationService::ApplyImpulses(grpc::CallbackServerContext*,
                                                                             v1::ImpulseSummary* response) {
-  return impulses_.Apply(response);
+  return inputs_.ApplyImpulses(response);
+}
+
+grpc::ServerUnaryReactor* SimulationService::SpawnBodies(grpc::CallbackServerContext*,
+                                                         const v1::SpawnBodiesRequest* request,
+                                                         v1::SpawnBodiesResponse* response) {
+  return inputs_.SpawnBodies(*request, response);
+}
+
+grpc::ServerUnaryReactor* SimulationService::RemoveBodies(grpc::CallbackServerContext*,
+                                                          const v1::RemoveBodiesRequest* request,
+                                                          v1::RemoveBodiesResponse* response) {
+  return inputs_.RemoveBodies(*request, response);
 }
 
 void SimulationService::Serve(const v1::Assignment& assignment, const World& world) {
-  impulses_.Serve();
+  inputs_.Serve(assignment.world(), world.environment.tick_us);
   const std::lock_guard lock(mutex_);
   serving_ = true;
   world_.Clear();
@@ -218,10 +232,10 @@ void SimulationService::Serve(const v1::Assignment& assignment, const World& wor
 }
 
 void SimulationService::Stop() {
-  impulses_.Stop();
+  inputs_.Stop();
   const std::lock_guard lock(mutex_);
   serving_ = false;
-  for (Watcher* w : watchers_) w->End({grpc::StatusCode::UNAVAILABLE, "this server gives up its region"});
+  for (Watcher* w : watchers_) w->End(RegionGivenUp());
 }
 
 void SimulationService::Publish(const Region& region, int64_t bodies) {

@@ -14,7 +14,7 @@
 #include "aureole/v1/simulation.grpc.pb.h"
 #include "server/core/region.h"
 #include "server/core/world.h"
-#include "server/transport/impulse_service.h"
+#include "server/transport/input_service.h"
 
 namespace aureole {
 
@@ -34,8 +34,13 @@ class SimulationService final : public v1::Simulation::CallbackService {
   grpc::ServerReadReactor<v1::ImpulseBatch>* ApplyImpulses(grpc::CallbackServerContext* context,
                                                            v1::ImpulseSummary* response) override;
 
-  // What clients push.
-  ImpulseService& impulses() { return impulses_; }
+  grpc::ServerUnaryReactor* SpawnBodies(grpc::CallbackServerContext* context, const v1::SpawnBodiesRequest* request,
+                                        v1::SpawnBodiesResponse* response) override;
+  grpc::ServerUnaryReactor* RemoveBodies(grpc::CallbackServerContext* context, const v1::RemoveBodiesRequest* request,
+                                         v1::RemoveBodiesResponse* response) override;
+
+  // What clients do to the world.
+  InputService& inputs() { return inputs_; }
 
   // From here on this region is served.
   void Serve(const v1::Assignment& assignment, const World& world);
@@ -47,7 +52,7 @@ class SimulationService final : public v1::Simulation::CallbackService {
  private:
   class Watcher;
 
-  ImpulseService impulses_;
+  InputService inputs_;
   std::atomic<int> watching_ = 0;  // size of watchers_
   std::atomic<Tick> tick_ = 0;
   std::atomic<int64_t> bodies_ = 0;

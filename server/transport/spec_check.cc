@@ -58,9 +58,12 @@ Path Path::operator[](std::string_view key) const {
   return Path(absl::StrCat(text_, "[\"", absl::string_view(key.data(), key.size()), "\"]"));
 }
 
-void SpecCheck::Fail(const Path& path, std::string_view what) {
+void SpecCheck::Fail(const Path& path, std::string_view what, v1::Reason reason) {
   if (!status_.ok()) return;
-  status_ = absl::InvalidArgumentError(absl::StrCat(path.str(), ": ", absl::string_view(what.data(), what.size())));
+  reason_ = reason;
+  field_ = path.str();
+  what_ = std::string(what);
+  status_ = absl::InvalidArgumentError(absl::StrCat(field_, ": ", what_));
 }
 
 double SpecCheck::In(const limits::Range& range, const Path& path, double value) {

@@ -8,6 +8,7 @@
 
 #include <absl/status/status.h>
 
+#include "aureole/v1/error.pb.h"
 #include "aureole/v1/types.pb.h"
 #include "aureole/v1/world.pb.h"
 #include "google/protobuf/duration.pb.h"
@@ -37,8 +38,12 @@ class SpecCheck {
   bool ok() const { return status_.ok(); }
   // OK, or InvalidArgument "<path>: <what>".
   const absl::Status& status() const { return status_; }
+  // Of the mistake.
+  v1::Reason reason() const { return reason_; }
+  const std::string& field() const { return field_; }
+  const std::string& what() const { return what_; }
 
-  void Fail(const Path& path, std::string_view what);
+  void Fail(const Path& path, std::string_view what, v1::Reason reason = v1::BAD_VALUE);
 
   // The value, if it is a number within the closed range.
   double In(const limits::Range& range, const Path& path, double value);
@@ -69,6 +74,8 @@ class SpecCheck {
   Quat TurnToQuat(const Path& path, const v1::Turn& turn);
 
   absl::Status status_;
+  v1::Reason reason_ = v1::REASON_UNSPECIFIED;
+  std::string field_, what_;
 };
 
 }  // namespace aureole

@@ -12,6 +12,7 @@
 #include <google/protobuf/io/coded_stream.h>
 #include <google/protobuf/io/zero_copy_stream_impl_lite.h>
 
+#include "server/transport/input_reader.h"
 #include "server/transport/world_bodies.h"
 #include "server/transport/world_events.h"
 #include "server/transport/world_json.h"
@@ -222,6 +223,7 @@ absl::StatusOr<World> WorldFromSpec(const v1::WorldSpec& spec) {
   if (check.ok()) ReadJoints(spec, &check, &world);
   if (check.ok()) ReadEvents(spec, &reader, &world);
   if (check.ok()) ReadInjectors(spec, &reader.catalogue, &check, &world);
+  ReadClientLimits(spec.client_limits(), &check);
   if (check.ok()) CheckInjected(reader.bodies, world, &check);
   if (!check.ok()) return check.status();
   const auto by_id = [](const BodySpec& a, const BodySpec& b) { return a.id < b.id; };

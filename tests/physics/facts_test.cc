@@ -54,6 +54,55 @@ TEST(Physics, FreeFallIsSemiImplicitEuler) {
   }
 }
 
+TEST(Physics, ImpulseAtAPointTurnsABodyAsItsMomentDoes) {
+  Environment e = Ground();
+  e.gravity.setZero();
+  const auto engine = MakeBulletEngine(e);
+  const Quat turned(Eigen::AngleAxisd(0.7, Vec3(1, 2, 3).normalized()));
+  for (BodyId id : {11, 12, 13}) {
+    BodySpec b = Dynamic(id, BoxShape(0.5, 0.3, 0.2), Vec3(static_cast<double>(id - 10) * 5, 5, 0));
+    b.orientation = turned;
+    engine->Spawn(b);
+  }
+  const Vec3 impulse(0.3, -0.2, 0.9), lever(0.4, 0.1, -0.2);
+  Input moment = Kick(11, impulse);
+  moment.angular = (turned * lever).cross(impulse);
+  Input at_world = Kick(12, impulse);
+  at_world.frame = Input::Frame::kWorld;
+  at_world.point = Vec3(10, 5, 0) + turned * lever;
+  Input at_body = Kick(13, impulse);
+  at_body.frame = Input::Frame::kBody;
+  at_body.point = lever;
+  for (const Input& i : {moment, at_world, at_body}) engine->Apply(i);
+  Advance(engine.get(), 0, 50);
+  const Quat first = engine->Pose(11).orientation;
+  EXPECT_GT(first.angularDistance(turned), 0.3);
+  for (BodyId id : {12, 13}) {
+    EXPECT_LT(engine->Pose(id).orientation.angularDistance(first), 1e-9) << id;
+    EXPECT_LT((engine->View(id).velocity - engine->View(11).velocity).norm(), 1e-12) << id;
+  }
+}
+
+TEST(Physics, ChangeOfVelocityAddsWhateverTheMass) {
+  const auto engine = MakeBulletEngine(Ground());
+  BodySpec b = Dynamic(7, SphereShape(0.5), Vec3(0, 9, 0));
+  b.mass = 400;
+  b.velocity = {1, 0, 0};
+  engine->Spawn(b);
+  Input change = Kick(7, Vec3(2, 0, -1));
+  change.kind = Input::Kind::kVelocityChange;
+  engine->Apply(change);
+  EXPECT_EQ(engine->View(7).velocity, Vec3(3, 0, -1));
+}
+
+TEST(Physics, LeastInertiaIsTheSmallestPrincipalMoment) {
+  const auto engine = MakeBulletEngine(Ground());
+  BodySpec b = Dynamic(7, BoxShape(0.5, 0.3, 0.2), Vec3(0, 9, 0));
+  b.mass = 12;
+  engine->Spawn(b);
+  EXPECT_NEAR(engine->View(7).least_inertia, 4 * (0.3 * 0.3 + 0.2 * 0.2), 1e-3);
+}
+
 TEST(Physics, RestingBoxSleepsAfterTheSleepTime) {
   const auto engine = MakeBulletEngine(Ground());
   engine->Spawn(Dynamic(7, BoxShape(0.5, 0.5, 0.5), Vec3(0, 0.5, 0)));

@@ -7,7 +7,9 @@
 
 #include <absl/strings/str_cat.h>
 
+#include "server/core/apply_input.h"
 #include "server/core/check.h"
+#include "server/core/input_schedule.h"
 #include "server/core/region.h"
 #include "tests/simulation/network.h"
 
@@ -117,7 +119,7 @@ class Run {
     for (const Input& i : region.TakeDelivered()) {
       if (heard == delivered_.size()) {
         delivered_.push_back(i);
-        accepted_[i.tick].push_back(i);
+        accepted_.Add(i);
       }
       const Input& first = delivered_[heard++];
       if (first.source != i.source || first.sequence != i.sequence || first.tick != i.tick) {
@@ -134,7 +136,7 @@ class Run {
     std::set<InputName> known;
     for (const InputOutcome& o : outcomes_) {
       const auto it = acted_.find(o.name);
-      if (it == acted_.end() || o.tick != it->second.first || o.applied != it->second.second) {
+      if (it == acted_.end() || o != it->second) {
         return Fail(o.tick, "inputs",
                     absl::StrCat("input ", o.name.second, " of client ", o.name.first,
                                  ": the outcome is not that of the undivided world"));
@@ -142,8 +144,8 @@ class Run {
       known.insert(o.name);
     }
     for (const auto& [name, acted] : acted_) {
-      if (acted.first + 2 * world_.exchange.k < checked_ && !known.contains(name)) {
-        return Fail(acted.first, "inputs",
+      if (acted.tick + 2 * world_.exchange.k < checked_ && !known.contains(name)) {
+        return Fail(acted.tick, "inputs",
                     absl::StrCat("input ", name.second, " of client ", name.first, " has no outcome"));
       }
     }
@@ -247,13 +249,14 @@ class Run {
   void StepReferenceInputs(Tick n) {
     std::vector<Input> inputs;
     ScriptedInputs(world_, n, &inputs);
-    auto& accepted = accepted_[n];
-    std::sort(accepted.begin(), accepted.end());
-    inputs.insert(inputs.end(), accepted.begin(), accepted.end());
+    accepted_.AppendDue(n, &inputs);
+    std::sort(inputs.begin(), inputs.end());
     for (const Input& i : inputs) {
       if (i.kind == Input::Kind::kSpawn) ++verdict_.spawns;
-      if (i.source != 0) acted_[{i.source, i.sequence}] = {n, reference_->Contains(i.body)};
-      if (i.kind == Input::Kind::kSpawn || reference_->Contains(i.body)) reference_->Apply(i);
+      const int64_t bodies = ApplyInput(i, reference_.get());
+      if (i.source == 0 || i.again) continue;
+      const InputName name{i.source, i.sequence};
+      acted_[name] = {name, n, bodies, i.kind == Input::Kind::kSpawn ? i.body : 0};
     }
   }
 
@@ -283,16 +286,16 @@ class Run {
   std::vector<std::unique_ptr<Region>> regions_;
   std::vector<bool> stalled_;
   std::map<Tick, Tally> before_step_, after_step_;
-  std::map<Tick, std::vector<Input>> accepted_;
+  InputSchedule accepted_;
   struct Client {
     std::vector<Input> inputs;
     RegionId region = 0;
     size_t next = 0, said = 0;  // of its inputs
   };
   std::vector<Client> clients_;
-  std::vector<Input> delivered_;                      // as the first region heard them
-  std::vector<size_t> heard_;                         // by region
-  std::map<InputName, std::pair<Tick, bool>> acted_;  // in the undivided world: when, and whether its body was there
+  std::vector<Input> delivered_;             // as the first region heard them
+  std::vector<size_t> heard_;                // by region
+  std::map<InputName, InputOutcome> acted_;  // in the undivided world
   std::vector<InputOutcome> outcomes_;
   std::map<BodyId, int64_t> groups_;
   std::map<BodyId, bool> asleep_;

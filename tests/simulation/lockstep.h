@@ -8,6 +8,8 @@
 #include <memory>
 #include <vector>
 
+#include "server/core/apply_input.h"
+#include "server/core/input_schedule.h"
 #include "server/core/region.h"
 #include "server/core/toy_engine.h"
 
@@ -93,18 +95,14 @@ class Undivided {
     for (const JointSpec& j : world.joints) engine_->Join(j);
   }
   // Takes effect at its tick, which is to come.
-  void Add(const Input& input) { live_.push_back(input); }
+  void Add(const Input& input) { live_.Add(input); }
   void RunTo(Tick n) {
     while (tick_ < n) {
       std::vector<Input> inputs;
       ScriptedInputs(world_, ++tick_, &inputs);
-      for (const Input& i : live_) {
-        if (i.tick == tick_) inputs.push_back(i);
-      }
+      live_.AppendDue(tick_, &inputs);
       std::sort(inputs.begin(), inputs.end());
-      for (const Input& i : inputs) {
-        if (i.kind == Input::Kind::kSpawn || engine_->Contains(i.body)) engine_->Apply(i);
-      }
+      for (const Input& i : inputs) ApplyInput(i, engine_.get());
       engine_->Step(tick_);
     }
   }
@@ -118,7 +116,7 @@ class Undivided {
  private:
   const World& world_;
   std::unique_ptr<Engine> engine_;
-  std::vector<Input> live_;
+  InputSchedule live_;
   Tick tick_ = 0;
 };
 

@@ -450,6 +450,54 @@ void Aim(Scenario* scenario, double rate, double top_speed, const std::optional<
   SortScript(&world);
 }
 
+// Makes an impulse at body `b` any other kind of live input.
+void Vary(const World& world, const BodySpec& b, Input* in, Random& rng) {
+  const Vec3 near = b.position + Flat(rng, rng.In(0, 3));
+  switch (rng.Below(8)) {
+    case 0:  // a force
+      in->ticks = 2 + rng.Below(30);
+      in->linear /= static_cast<double>(in->ticks);
+      break;
+    case 1:
+      in->kind = Input::Kind::kVelocityChange;
+      in->linear /= b.mass;
+      break;
+    case 2:
+      in->frame = rng.Chance(0.5) ? Input::Frame::kWorld : Input::Frame::kBody;
+      in->point = in->frame == Input::Frame::kWorld ? near : Vec3(Flat(rng, rng.In(0, 0.5)));
+      in->linear *= 0.1;
+      break;
+    case 3:
+    case 4:  // an explosion
+      in->body = 0;
+      in->kind = rng.Chance(0.5) ? Input::Kind::kVelocityChange : Input::Kind::kImpulse;
+      in->area = {near, rng.In(1, 6), (in->kind == Input::Kind::kImpulse ? b.mass : 1) * rng.In(-5, 20),
+                  rng.Chance(0.5)};
+      in->linear = Vec3::Zero();
+      in->ticks = in->kind == Input::Kind::kImpulse && rng.Chance(0.3) ? 5 : 1;
+      break;
+    case 5: {  // on top of another body, or next to it
+      in->kind = Input::Kind::kSpawn;
+      in->body = 0;
+      auto spawn = std::make_shared<BodySpec>(world.bodies[rng.Below(static_cast<int>(world.bodies.size()))]);
+      spawn->id = 0;
+      spawn->position = near;
+      spawn->asleep = false;
+      spawn->velocity = Flat(rng, kSpeed * rng.Unit() * 0.9);
+      in->spawn = std::move(spawn);
+      break;
+    }
+    case 6:
+      if (std::none_of(world.joints.begin(), world.joints.end(),
+                       [&b](const JointSpec& j) { return j.a == b.id || j.b == b.id; })) {
+        in->kind = Input::Kind::kRemove;
+      }
+      break;
+    default:
+      break;
+  }
+}
+
 void AddLive(Scenario* s, int n, Random& rng) {
   for (int i = 0; i < n && !s->world.bodies.empty(); ++i) {
     Input in;
@@ -460,6 +508,7 @@ void AddLive(Scenario* s, int n, Random& rng) {
     in.body = b.id;
     in.linear = Flat(rng, kSpeed * rng.Unit() * b.mass);
     s->live.push_back(in);
+    Vary(s->world, b, &s->live.back(), rng);
   }
   std::stable_sort(s->live.begin(), s->live.end(), [](const Input& x, const Input& y) { return x.tick < y.tick; });
   std::map<uint64_t, uint64_t> sequences;
@@ -537,7 +586,7 @@ Scenario MakeScenario(uint64_t seed, const ScenarioOptions& options, const Engin
                       : rng.Chance(0.5)                       ? 0.02
                                                               : 0.12;
   Aim(&s, build.stirred ? 0.12 : options.toy ? rate : rate / 4, build.top_speed, build.stirred, rng, make_engine);
-  if (rng.Chance(0.2)) AddLive(&s, 1 + rng.Below(10), rng);
+  if (rng.Chance(0.3)) AddLive(&s, 1 + rng.Below(15), rng);
   return s;
 }
 

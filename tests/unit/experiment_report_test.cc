@@ -52,6 +52,15 @@ TEST(ExperimentReport, TableNamesTheRegionThatMissedTheAimAndItsClusters) {
       << text;
 }
 
+TEST(ExperimentReport, RatioIsTheMedianOfThoseOfTheRounds) {
+  Row row;
+  row.measure = LastWindow(10, 1);
+  const Reference reference{"one", LastWindow(40, 1)};
+  EXPECT_DOUBLE_EQ(row.Ratio(reference), 0.25);
+  row.ratios = {0.3, 0.2, 9};
+  EXPECT_DOUBLE_EQ(row.Ratio(reference), 0.3);
+}
+
 TEST(ExperimentReport, TableHasBothFrameTimesTheirRatioAndTheIdeal) {
   const std::string text = TableText(TwoRuns(12));
   EXPECT_NE(text.find("last max ms one server ms  ratio ideal 1/n ratio/ideal\n"), std::string::npos) << text;

@@ -27,6 +27,53 @@ Aura MakeAura(BodyId id, bool predicted) {
   return a;
 }
 
+Input Force() {
+  Input input;
+  input.source = 4;
+  input.sequence = 19;
+  input.body = 11;
+  input.frame = Input::Frame::kBody;
+  input.point = {0.1, -0.0, 3};
+  input.linear = {1.0 / 3, 0, 0};
+  input.ticks = 77;
+  return input;
+}
+
+Input Explosion() {
+  Input input;
+  input.source = ~0ull;
+  input.sequence = 2;
+  input.kind = Input::Kind::kVelocityChange;
+  input.area = {{0.1, 0.2, 0.3}, 7.7, -0.1, true};
+  return input;
+}
+
+Input Spawn() {
+  auto ball = std::make_shared<Shape>();
+  ball->radius = 0.1;
+  auto hull = std::make_shared<Shape>();
+  hull->kind = ShapeKind::kHull;
+  hull->points = {{0.1, 0, 0}, {0, 1, -1}, {-1, -1, 0}, {0, 0, 1}};
+  hull->radius = 1;
+  auto body = std::make_shared<BodySpec>();
+  auto shape = std::make_shared<Shape>();
+  shape->kind = ShapeKind::kCompound;
+  shape->children = {{{0.3, 0, 0}, Quat(0.6, 0.8, 0, 0), ball}, {{-0.3, 0, 0}, Quat::Identity(), hull}};
+  body->shape = shape;
+  body->mass = 1.0 / 7;
+  body->position = {1e5 / 3, 2, 3};
+  body->velocity = {0, 0.1, 0};
+  body->angular_velocity = {0, 0, -0.7};
+  body->material.friction = 0.3;
+  body->ccd = true;
+  Input input;
+  input.source = 5;
+  input.sequence = 1;
+  input.kind = Input::Kind::kSpawn;
+  input.spawn = body;
+  return input;
+}
+
 Frame MakeFrame(bool predicted) {
   Frame f;
   f.from = 1;
@@ -53,7 +100,10 @@ Frame MakeFrame(bool predicted) {
   input.kind = Input::Kind::kRemove;
   input.linear = input.angular = Vec3::Zero();
   g.inputs.push_back(input);
-  g.applied = {{4, 16}, {~0ull, 1}};
+  g.inputs.push_back(Force());
+  g.inputs.push_back(Explosion());
+  g.inputs.push_back(Spawn());
+  g.applied = {{{4, 16}, 1}, {{~0ull, 1}, 3}};
   f.graphs[1].of = 3;
   f.graphs[1].opened = {0, 7};
   f.graphs[1].closed = {2};
@@ -77,6 +127,32 @@ Frame MakeFrame(bool predicted) {
 
 bool SameBits(const Vec3& a, const Vec3& b) { return std::memcmp(a.data(), b.data(), 3 * sizeof(double)) == 0; }
 
+void ExpectSame(const Shape& a, const Shape& b) {
+  EXPECT_EQ(a.kind, b.kind);
+  EXPECT_EQ(a.radius, b.radius);
+  EXPECT_TRUE(SameBits(a.half, b.half));
+  ASSERT_EQ(a.points.size(), b.points.size());
+  for (size_t i = 0; i < a.points.size(); ++i) EXPECT_TRUE(SameBits(a.points[i], b.points[i]));
+  ASSERT_EQ(a.children.size(), b.children.size());
+  for (size_t i = 0; i < a.children.size(); ++i) {
+    EXPECT_TRUE(SameBits(a.children[i].position, b.children[i].position));
+    EXPECT_EQ(a.children[i].orientation.coeffs(), b.children[i].orientation.coeffs());
+    ExpectSame(*a.children[i].shape, *b.children[i].shape);
+  }
+}
+
+void ExpectSame(const BodySpec& a, const BodySpec& b) {
+  ExpectSame(*a.shape, *b.shape);
+  EXPECT_EQ(a.mass, b.mass);
+  EXPECT_TRUE(SameBits(a.position, b.position) && SameBits(a.velocity, b.velocity));
+  EXPECT_TRUE(SameBits(a.angular_velocity, b.angular_velocity));
+  EXPECT_EQ(a.orientation.coeffs(), b.orientation.coeffs());
+  EXPECT_EQ(a.material.friction, b.material.friction);
+  EXPECT_EQ(a.material.angular_damping, b.material.angular_damping);
+  EXPECT_EQ(a.ccd, b.ccd);
+  EXPECT_EQ(a.asleep, b.asleep);
+}
+
 void ExpectSame(const Graph& a, const Graph& b) {
   EXPECT_EQ(a.of, b.of);
   EXPECT_EQ(a.edges, b.edges);
@@ -97,7 +173,12 @@ void ExpectSame(const Graph& a, const Graph& b) {
   for (size_t i = 0; i < a.inputs.size(); ++i) {
     const Input &p = a.inputs[i], &q = b.inputs[i];
     EXPECT_TRUE(p.source == q.source && p.sequence == q.sequence && p.kind == q.kind && p.body == q.body);
-    EXPECT_TRUE(SameBits(p.linear, q.linear) && SameBits(p.angular, q.angular));
+    EXPECT_TRUE(SameBits(p.linear, q.linear) && SameBits(p.angular, q.angular) && SameBits(p.point, q.point));
+    EXPECT_TRUE(p.frame == q.frame && p.ticks == q.ticks);
+    EXPECT_TRUE(SameBits(p.area.centre, q.area.centre) && p.area.radius == q.area.radius);
+    EXPECT_TRUE(p.area.outward == q.area.outward && p.area.fades == q.area.fades);
+    ASSERT_EQ(p.spawn != nullptr, q.spawn != nullptr);
+    if (p.spawn != nullptr) ExpectSame(*p.spawn, *q.spawn);
   }
   EXPECT_EQ(a.applied, b.applied);
   EXPECT_EQ(a.opened, b.opened);
@@ -224,7 +305,29 @@ TEST(FrameCodec, RefusesWhatNoRegionSends) {
   refused("frame.transfer.state", [](v1::Frame* f) { f->mutable_transfer(0)->clear_state(); });
   refused("frame.transfer.spawn_tick", [](v1::Frame* f) { f->mutable_transfer(0)->add_spawn_tick(1); });
   refused("frame.transfer.spawn_body", [](v1::Frame* f) { f->mutable_transfer(0)->set_spawn_body(0, 0); });
-  refused("frame.graph.input.kind", [](v1::Frame* f) { f->mutable_graph(0)->mutable_input(0)->set_kind(1); });
+  refused("frame.graph.input.kind", [](v1::Frame* f) { f->mutable_graph(0)->mutable_input(0)->set_kind(6); });
+  refused("frame.graph.input.ticks", [](v1::Frame* f) { f->mutable_graph(0)->mutable_input(0)->set_ticks(2); });
+  refused("frame.graph.input.point", [](v1::Frame* f) { f->mutable_graph(0)->mutable_input(2)->add_point(1); });
+  refused("frame.graph.input.frame", [](v1::Frame* f) { f->mutable_graph(0)->mutable_input(2)->set_frame(3); });
+  refused("frame.graph.input.ticks", [](v1::Frame* f) { f->mutable_graph(0)->mutable_input(2)->set_ticks(1 << 20); });
+  const auto area = [](v1::Frame* f) { return f->mutable_graph(0)->mutable_input(3)->mutable_area(); };
+  refused("frame.graph.input.area.radius", [&](v1::Frame* f) { area(f)->set_radius(0); });
+  refused("frame.graph.input.area.radius", [&](v1::Frame* f) { area(f)->set_radius(HUGE_VAL); });
+  refused("frame.graph.input.area", [&](v1::Frame* f) { area(f)->set_outward(NAN); });
+  refused("frame.graph.input.area.centre", [&](v1::Frame* f) { area(f)->add_centre(1); });
+  refused("frame.graph.input.body", [](v1::Frame* f) { f->mutable_graph(0)->mutable_input(3)->set_body(1); });
+  const auto spawn = [](v1::Frame* f) { return f->mutable_graph(0)->mutable_input(4)->mutable_spawn(); };
+  refused("frame.graph.input.spawn.mass", [&](v1::Frame* f) { spawn(f)->set_mass(0); });
+  refused("frame.graph.input.spawn.material", [&](v1::Frame* f) { spawn(f)->add_material(0); });
+  refused("frame.graph.input.spawn.orientation", [&](v1::Frame* f) { spawn(f)->set_orientation(3, 9); });
+  refused("frame.graph.input.spawn.position", [&](v1::Frame* f) { spawn(f)->set_position(0, NAN); });
+  refused("frame.graph.input.spawn.shape.kind", [&](v1::Frame* f) { spawn(f)->mutable_shape()->set_kind(7); });
+  refused("frame.graph.input.spawn.shape.children", [&](v1::Frame* f) { spawn(f)->mutable_shape()->clear_children(); });
+  refused("frame.graph.input.spawn.shape.radius",
+          [&](v1::Frame* f) { spawn(f)->mutable_shape()->mutable_children(0)->mutable_shape()->set_radius(-1); });
+  refused("frame.graph.input.spawn.shape.points",
+          [&](v1::Frame* f) { spawn(f)->mutable_shape()->mutable_children(1)->mutable_shape()->add_points(1); });
+  refused("frame.graph.applied_bodies", [](v1::Frame* f) { f->mutable_graph(0)->set_applied_bodies(0, 0); });
   refused("frame.graph.input", [](v1::Frame* f) { f->mutable_graph(0)->mutable_input(0)->set_source(0); });
   refused("frame.graph.input.linear", [](v1::Frame* f) { f->mutable_graph(0)->mutable_input(0)->set_linear(1, NAN); });
   refused("frame.graph.applied_sequence", [](v1::Frame* f) { f->mutable_graph(0)->add_applied_sequence(1); });

@@ -17,11 +17,11 @@ Input Kick(uint64_t sequence) {
 
 // Tells, delivers, applies and settles what is offered, in one tick.
 void RunTick(LiveInputs* live, Tick n, bool apply = true) {
-  live->Deliver(live->TakeOffered(), n, true);
+  live->Deliver(live->TakeOffered(), n, n, true);
   std::vector<Input> due;
-  live->AppendDue(n, &due);
+  live->due().AppendDue(n, &due);
   for (const Input& i : due) {
-    if (apply) live->Applied(i);
+    if (apply) live->Applied(i, 1);
   }
   live->Heard(live->TakeApplied());
   live->Settle(n);
@@ -41,14 +41,14 @@ TEST(LiveInputs, MoreThanATickCanTellWaitForTheNext) {
 
 TEST(LiveInputs, RepetitionWhileItIsOpenGetsItsOutcomeToo) {
   LiveInputs live;
-  live.Deliver({Kick(1)}, 7, false);  // another region told it
-  live.Deliver({Kick(1)}, 8, true);
-  live.Heard({{3, 1}});
+  live.Deliver({Kick(1)}, 7, 7, false);  // another region told it
+  live.Deliver({Kick(1)}, 8, 8, true);
+  live.Heard({{{3, 1}, 1}});
   live.Settle(7);
   const std::vector<InputOutcome> outcomes = live.TakeOutcomes();
   ASSERT_EQ(outcomes.size(), 1u);
   EXPECT_EQ(outcomes[0].tick, 7);
-  EXPECT_TRUE(outcomes[0].applied);
+  EXPECT_TRUE(outcomes[0].applied());
   EXPECT_EQ(live.TakeDelivered().size(), 1u);
 }
 
@@ -70,7 +70,7 @@ TEST(LiveInputs, OutcomeThatIsNoLongerKeptIsForgottenAndActsNotAgain) {
   ASSERT_EQ(outcomes.size(), 2u);
   EXPECT_EQ(outcomes[0].tick, 0) << "forgotten";
   EXPECT_EQ(outcomes[1].tick, 2);
-  EXPECT_FALSE(outcomes[1].applied);
+  EXPECT_FALSE(outcomes[1].applied());
   EXPECT_TRUE(live.TakeDelivered().empty());
 }
 

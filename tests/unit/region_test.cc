@@ -281,7 +281,7 @@ TEST(Region, InputOfAClientActsWhereverItWasOfferedTwoTicksLater) {
   const std::vector<InputOutcome> outcomes = s.region(1).TakeOutcomes();
   ASSERT_EQ(outcomes.size(), 1u);
   EXPECT_EQ(outcomes[0].tick, 12);
-  EXPECT_TRUE(outcomes[0].applied);
+  EXPECT_TRUE(outcomes[0].applied());
   for (RegionId r : {0, 1}) {
     const std::vector<Input> delivered = s.region(r).TakeDelivered();
     ASSERT_EQ(delivered.size(), 1u);
@@ -310,7 +310,7 @@ TEST(Region, WhatAClientRepeatsActsOnceAndHasTheSameOutcome) {
   ASSERT_EQ(outcomes.size(), 2u);
   for (const InputOutcome& o : outcomes) {
     EXPECT_EQ(o.tick, 2);
-    EXPECT_TRUE(o.applied);
+    EXPECT_TRUE(o.applied());
   }
 }
 
@@ -320,7 +320,79 @@ TEST(Region, InputForABodyThatIsNowhereIsNotApplied) {
   s.RunTo(5);
   const std::vector<InputOutcome> outcomes = s.region(0).TakeOutcomes();
   ASSERT_EQ(outcomes.size(), 1u);
-  EXPECT_FALSE(outcomes[0].applied);
+  EXPECT_FALSE(outcomes[0].applied());
+}
+
+TEST(Region, ExplosionOverABorderActsOnTheBodiesOfBothSidesOnce) {
+  World w = TwoColumns();
+  w.bodies = {Ball(1, -2), Ball(2, 2), Ball(3, 9), Ball(4, 0.3)};
+  Lockstep s(w);
+  Input blast = Kick(1, 0);
+  blast.kind = Input::Kind::kImpulse;
+  blast.linear.setZero();
+  blast.area = {{0.3, w.bodies[0].position.y(), 0}, 4, 6, true};
+  ASSERT_TRUE(s.region(1).Submit(blast).ok());
+  Undivided one(s.world());
+  s.RunTo(2);
+  for (Input i : s.region(0).TakeDelivered()) one.Add(i);
+  one.RunTo(2);
+  EXPECT_EQ(s.Hash(), one.Hash());
+  EXPECT_LT(s.region(0).engine().View(1).velocity.x(), -1) << "away from the centre";
+  EXPECT_GT(s.region(1).engine().View(2).velocity.x(), 1);
+  EXPECT_EQ(s.region(1).engine().View(3).velocity.x(), 0) << "out of reach";
+  EXPECT_EQ(s.region(1).engine().View(4).velocity.x(), 0) << "in the very centre";
+  const std::vector<InputOutcome> outcomes = s.region(1).TakeOutcomes();
+  ASSERT_EQ(outcomes.size(), 1u);
+  EXPECT_EQ(outcomes[0].bodies, 3);
+}
+
+TEST(Region, ForceActsInEachOfItsTicksAlsoAcrossTheBorder) {
+  World w = TwoColumns();
+  w.bodies = {Ball(1, -0.5)};
+  Lockstep s(w);
+  Input force = Kick(1, 1, 0.25);
+  force.kind = Input::Kind::kImpulse;
+  force.ticks = 60;
+  ASSERT_TRUE(s.region(1).Submit(force).ok());
+  Undivided one(s.world());
+  s.RunTo(1);
+  for (Input i : s.region(0).TakeDelivered()) one.Add(i);
+  for (Tick n = 2; n <= 70; ++n) {
+    s.RunTo(n);
+    one.RunTo(n);
+    ASSERT_EQ(s.Hash(), one.Hash()) << n;
+  }
+  EXPECT_EQ(s.Owner(1), 1) << "it was pushed over";
+  EXPECT_DOUBLE_EQ(s.region(1).engine().View(1).velocity.x(), 60 * 0.25 / w.bodies[0].mass);
+  const std::vector<InputOutcome> outcomes = s.region(1).TakeOutcomes();
+  ASSERT_EQ(outcomes.size(), 1u);
+  EXPECT_EQ(outcomes[0].bodies, 1);
+}
+
+Input SpawnAt(uint64_t sequence, double x) {
+  Input i = Kick(sequence, 0);
+  i.kind = Input::Kind::kSpawn;
+  i.spawn = std::make_shared<const BodySpec>(Ball(0, x));
+  return i;
+}
+
+TEST(Region, BodiesThatClientsSpawnGetIdsInTheOrderInWhichTheyAreTold) {
+  Lockstep s(TwoColumns());
+  ASSERT_TRUE(s.region(1).Submit(SpawnAt(1, -3)).ok());
+  Input other = SpawnAt(1, 3);
+  other.source = 2;
+  ASSERT_TRUE(s.region(0).Submit(other).ok());
+  s.RunTo(2);
+  EXPECT_EQ(s.Owner(kFirstLiveId), 1) << "region 0 speaks first";
+  EXPECT_EQ(s.Owner(kFirstLiveId + 1), 0);
+  const std::vector<InputOutcome> outcomes = s.region(1).TakeOutcomes();
+  ASSERT_EQ(outcomes.size(), 1u);
+  EXPECT_EQ(outcomes[0].body, kFirstLiveId + 1);
+  EXPECT_EQ(outcomes[0].bodies, 1);
+  ASSERT_TRUE(s.region(0).Submit(SpawnAt(1, -3)).ok());
+  s.RunTo(5);
+  EXPECT_EQ(s.Owner(kFirstLiveId + 2), kNoRegion) << "a repetition spawns nothing";
+  EXPECT_EQ(s.region(0).TakeOutcomes().back().body, kFirstLiveId + 1);
 }
 
 TEST(Region, InputThatCannotBeIsRefusedWithTheField) {
@@ -333,7 +405,18 @@ TEST(Region, InputThatCannotBeIsRefusedWithTheField) {
   refused("input.source", [](Input* i) { i->source = 0; });
   refused("input.sequence", [](Input* i) { i->sequence = 0; });
   refused("input.body", [](Input* i) { i->body = 0; });
-  refused("input.kind", [](Input* i) { i->kind = Input::Kind::kSpawn; });
+  refused("input.kind", [](Input* i) { i->kind = static_cast<Input::Kind>(9); });
+  refused("input.spawn", [](Input* i) { i->kind = Input::Kind::kSpawn; });
+  refused("input.body", [](Input* i) { i->area.radius = 1; });
+  refused("input.area: only", [](Input* i) {
+    i->area.radius = 1;
+    i->body = 0;
+  });
+  refused("input.area.radius", [](Input* i) { i->area.radius = -1; });
+  refused("input.area", [](Input* i) { i->area.outward = std::nan(""); });
+  refused("input.point", [](Input* i) { i->point.x() = std::nan(""); });
+  refused("input.frame", [](Input* i) { i->frame = static_cast<Input::Frame>(3); });
+  refused("input.ticks", [](Input* i) { i->ticks = 2; });
   refused("input.linear", [](Input* i) { i->linear.x() = std::nan(""); });
   refused("input.angular", [](Input* i) { i->angular.y() = -HUGE_VAL; });
 }
