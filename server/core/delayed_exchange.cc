@@ -215,7 +215,7 @@ void DelayedExchange::Send(std::vector<BodyId> ids, RegionId to, TransferCause c
     if (auto b = bounds_.find(id); b != bounds_.end()) s.bound = b->second;
     shadows_[id] = std::move(s);
   }
-  Transfer t = h_.Depart(ids, cause);
+  Transfer t = h_.Depart(ids, to, cause);
   if (!existing.empty()) t.state = h_.engine->Extract(existing);
   FastForward(&t);
   for (BodyId id : ids) waiting_.erase(id);

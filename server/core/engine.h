@@ -52,13 +52,21 @@ struct BodyView {
   bool asleep = false;
 };
 
-// What an observer sees of one body. Not for the tick.
+// Where an observer sees one body.
 struct BodyPose {
+  BodyId id = 0;
   Vec3 position;  // of the centre of mass
   Quat orientation = Quat::Identity();
-  Vec3 velocity;  // m/s
+  Vec3 velocity;          // m/s
+  Vec3 angular_velocity;  // rad/s
   bool asleep = false;
+};
+
+// What stays the same in a body's life.
+struct BodyLook {
   std::shared_ptr<const Shape> shape;
+  double mass = 0;  // kg
+  Material material;
 };
 
 struct EngineCounts {
@@ -82,9 +90,10 @@ class Engine {
   virtual void Step(Tick n) = 0;
 
   virtual bool Contains(BodyId id) const = 0;
-  // Precondition of the four below: Contains(id).
+  // Precondition of the five below: Contains(id).
   virtual BodyView View(BodyId id) const = 0;
   virtual BodyPose Pose(BodyId id) const = 0;
+  virtual BodyLook Look(BodyId id) const = 0;
   // Of everything that decides the body's future: pose, velocities, sleep state and timer. Equal states, equal hashes.
   virtual uint64_t Hash(BodyId id) const = 0;
   // Bodies that share a joint with it, ascending, appended.
@@ -97,6 +106,13 @@ class Engine {
   virtual void CollectOutside(const Rect& interior, double margin, std::vector<BodyId>* out) const = 0;
   // Dynamic bodies whose exact box meets `box`, ascending, appended. Costs O(log bodies + hits).
   virtual void Query(const Box& box, std::vector<BodyId>* out) const = 0;
+  // For observers: poses of the dynamic bodies that are awake, and of those that Query finds; ascending ids, appended.
+  virtual void AppendAwake(std::vector<BodyPose>* out) const = 0;
+  virtual void AppendPoses(const Box& box, std::vector<BodyPose>* out) const = 0;
+  virtual int64_t CountAwake() const = 0;  // constant time
+  // From here on, bodies that fall asleep are noted; and those noted since the last call, appended in no order.
+  virtual void NoteSleepers(bool on) = 0;
+  virtual void TakeSleepers(std::vector<BodyId>* out) = 0;
   // Largest BodyView::radius of any body that ever was here.
   virtual double MaxRadius() const = 0;
 

@@ -164,19 +164,30 @@ void Holdings::AppendInputs(Tick n, std::vector<Input>* out) const {
 }
 
 void Holdings::Apply(const Input& input) {
+  if (watched && input.kind == Input::Kind::kRemove && engine->Contains(input.body)) {
+    changes.gone.push_back(
+        {input.body, kNoRegion, held.at(input.body).epoch, tick + 1, engine->View(input.body).centre});
+  }
   const int64_t bodies = ApplyInput(input, engine.get());
-  if (input.kind == Input::Kind::kSpawn) held.try_emplace(input.spawn->id);
+  if (input.kind == Input::Kind::kSpawn) {
+    held.try_emplace(input.spawn->id);
+    if (watched) changes.came.push_back(input.spawn->id);
+  }
   if (input.kind == Input::Kind::kRemove && bodies > 0) held.erase(input.body);
   if (input.source != 0) live.Applied(input, bodies);
 }
 
-Transfer Holdings::Depart(std::vector<BodyId> ids, TransferCause cause) {
+Transfer Holdings::Depart(std::vector<BodyId> ids, RegionId to, TransferCause cause) {
   Transfer t;
   t.cause = cause;
   for (BodyId id : ids) {
     auto it = held.find(id);
     AUREOLE_CHECK(it != held.end(), "region %d does not own body %llu", self, static_cast<unsigned long long>(id));
     t.epochs.push_back(it->second.epoch + 1);
+    if (watched && engine->Contains(id)) {
+      const Tick from = tick + std::max(1, world.exchange.k);
+      changes.gone.push_back({id, to, t.epochs.back(), from, engine->View(id).centre});
+    }
     held.erase(it);
   }
   for (auto it = pending.begin(); it != pending.end();) {
@@ -208,6 +219,7 @@ void Holdings::Arrive(const Transfer& t, RegionId from, Tick n) {
     const bool fresh = held.emplace(t.ids[i], Held{t.epochs[i], n, transfer}).second;
     AUREOLE_CHECK(fresh, "body %llu came from region %d but region %d owns it",
                   static_cast<unsigned long long>(t.ids[i]), from, self);
+    if (watched) changes.came.push_back(t.ids[i]);
     if (t.cause == TransferCause::kAuraCollision) newcomers_.emplace_back(t.ids[i], transfer);
   }
   pending.insert(pending.end(), t.pending.begin(), t.pending.end());

@@ -54,6 +54,8 @@ struct Holdings {
   Tick tick = 0;  // last stepped
   RegionStats stats;
   std::vector<Violation> violations;
+  bool watched = false;  // changes are noted
+  BodyChanges changes;
 
   std::vector<Input> pending;  // k >= 1: announced spawns of owned bodies that have not taken effect, in Input's order
   LiveInputs live;
@@ -65,8 +67,8 @@ struct Holdings {
   void AppendInputs(Tick n, std::vector<Input>* out) const;
   // Applies it to what it means of the bodies here; a spawn always.
   void Apply(const Input& input);
-  // Extracts a closed set of owned bodies for a new owner.
-  Transfer Depart(std::vector<BodyId> ids, TransferCause cause);
+  // Gives up owned bodies for a new owner.
+  Transfer Depart(std::vector<BodyId> ids, RegionId to, TransferCause cause);
   // Takes over what a peer sent.
   void Arrive(const Transfer& transfer, RegionId from, Tick n);
   void Report(const Violation& v);

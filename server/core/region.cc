@@ -131,6 +131,21 @@ uint64_t Region::StateHash() const {
   return sum;
 }
 
+void Region::WatchChanges(bool on) {
+  Holdings& h = impl_->holdings;
+  h.watched = on;
+  h.changes = {};
+  h.engine->NoteSleepers(on);
+}
+
+BodyChanges Region::TakeChanges() {
+  Holdings& h = impl_->holdings;
+  h.engine->TakeSleepers(&h.changes.slept);
+  return std::exchange(h.changes, {});
+}
+
+Epoch Region::EpochOf(BodyId id) const { return impl_->holdings.held.at(id).epoch; }
+
 int64_t Region::bodies() const { return static_cast<int64_t>(impl_->holdings.held.size()); }
 const RegionStats& Region::stats() const { return impl_->holdings.stats; }
 std::vector<Violation> Region::TakeViolations() { return std::exchange(impl_->holdings.violations, {}); }

@@ -72,6 +72,20 @@ struct BodyRecord {
   Box box;
 };
 
+// Bodies that came to a region and went, for those who watch it.
+struct BodyChanges {
+  struct Gone {
+    BodyId id = 0;
+    RegionId to = kNoRegion;  // kNoRegion: removed
+    Epoch epoch = 0;          // that it has there
+    Tick from = 0;            // the first state in which it is there
+    Vec3 at = Vec3::Zero();   // where it was, m
+  };
+  std::vector<BodyId> came;   // spawned or transferred here; may be gone again
+  std::vector<Gone> gone;     // in the order in which they went; may have come again
+  std::vector<BodyId> slept;  // fell asleep; may be awake again or gone
+};
+
 class Region {
  public:
   // `engine` holds the world's environment and no dynamic body; the region loads its share of the initial state.
@@ -114,6 +128,13 @@ class Region {
   void Observe(std::vector<BodyRecord>* out) const;
   // Sum over these bodies of a hash of (id, hash): add the regions' values to get the world's (I6).
   uint64_t StateHash() const;
+
+  // From here on changes are noted; they cost memory until they are taken.
+  void WatchChanges(bool on);
+  // Since the last call.
+  BodyChanges TakeChanges();
+  // Precondition: it is in the engine.
+  Epoch EpochOf(BodyId id) const;
 
   // Bodies owned, announced spawns included. Constant time.
   int64_t bodies() const;

@@ -516,7 +516,7 @@ class SyncExchange final : public Protocol {
 
   void Send(std::vector<BodyId> ids, RegionId to, TransferCause cause, std::map<RegionId, Frame>* leaving) {
     std::sort(ids.begin(), ids.end());
-    Transfer t = h_.Depart(std::move(ids), cause);
+    Transfer t = h_.Depart(std::move(ids), to, cause);
     t.state = h_.engine->Extract(t.ids);
     auto it = leaving->find(to);
     if (it == leaving->end()) it = leaving->emplace(to, MakeFrame({to}, kTransfers)).first;

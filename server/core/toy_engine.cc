@@ -151,12 +151,37 @@ class ToyEngine final : public Engine {
     return v;
   }
 
-  BodyPose Pose(BodyId id) const override {
+  BodyPose Pose(BodyId id) const override { return PoseOf(At(id)); }
+
+  BodyLook Look(BodyId id) const override {
     const Body& b = At(id);
     auto shape = std::make_shared<Shape>();
     shape->kind = ShapeKind::kBox;
     shape->half = ToVec(b.half);
-    return {ToVec(b.position), Quat::Identity(), ToVec(b.velocity), b.asleep != 0, std::move(shape)};
+    return {std::move(shape), b.mass, {}};
+  }
+
+  void AppendAwake(std::vector<BodyPose>* out) const override {
+    for (BodyId id : Ids()) {
+      if (At(id).asleep == 0) out->push_back(PoseOf(At(id)));
+    }
+  }
+
+  void AppendPoses(const Box& box, std::vector<BodyPose>* out) const override {
+    std::vector<BodyId> ids;
+    Query(box, &ids);
+    for (BodyId id : ids) out->push_back(PoseOf(At(id)));
+  }
+
+  int64_t CountAwake() const override { return Counts().awake; }
+
+  void NoteSleepers(bool on) override {
+    note_fallen_ = on;
+    fallen_.clear();
+  }
+  void TakeSleepers(std::vector<BodyId>* out) override {
+    out->insert(out->end(), fallen_.begin(), fallen_.end());
+    fallen_.clear();
   }
 
   uint64_t Hash(BodyId id) const override {
@@ -264,6 +289,9 @@ class ToyEngine final : public Engine {
   }
 
  private:
+  static BodyPose PoseOf(const Body& b) {
+    return {b.id, ToVec(b.position), Quat::Identity(), ToVec(b.velocity), Vec3::Zero(), b.asleep != 0};
+  }
   static Box BoxOf(const Body& b) { return {ToVec(b.position) - ToVec(b.half), ToVec(b.position) + ToVec(b.half)}; }
   std::vector<Body>::const_iterator Find(BodyId id) const {
     auto it = std::lower_bound(bodies_.begin(), bodies_.end(), id, [](const Body& b, BodyId i) { return b.id < i; });
@@ -366,7 +394,7 @@ class ToyEngine final : public Engine {
     return true;
   }
 
-  void Integrate(Body& b) const {
+  void Integrate(Body& b) {
     if (b.asleep) return;
     const double dt = environment_->dt();
     for (int i = 0; i < 3; ++i) b.velocity[i] += environment_->gravity[i] * dt;
@@ -382,12 +410,15 @@ class ToyEngine final : public Engine {
       b.slow = 0;
     } else if (++b.slow >= kSleepTicks) {
       b.asleep = 1;
+      if (note_fallen_) fallen_.push_back(b.id);
       std::fill(b.velocity, b.velocity + 3, 0.0);
     }
   }
 
   std::shared_ptr<const Environment> environment_;
   double floor_ = -1e300;
+  bool note_fallen_ = false;
+  std::vector<BodyId> fallen_;
   double max_radius_ = 0;
   std::vector<Body> bodies_;  // ascending by id
   std::vector<Joint> joints_;

@@ -28,6 +28,19 @@ btVector3 Lever(const Input& input, const btRigidBody& rigid) {
   return btVector3(0, 0, 0);
 }
 
+BodyPose PoseOf(const Body& body) {
+  const btTransform& at = body.rigid.getWorldTransform();
+  const btQuaternion turn = at.getRotation();
+  return {body.id,
+          FromBullet(at.getOrigin()),
+          Quat(turn.w(), turn.x(), turn.y(), turn.z()),
+          FromBullet(body.rigid.getLinearVelocity()),
+          FromBullet(body.rigid.getAngularVelocity()),
+          body.asleep};
+}
+
+bool ById(const BodyPose& x, const BodyPose& y) { return x.id < y.id; }
+
 class BulletEngine : public Engine {
  public:
   BulletEngine(std::shared_ptr<Surroundings> surroundings, int pool) : world_(std::move(surroundings), pool) {}
@@ -40,12 +53,18 @@ class BulletEngine : public Engine {
   bool Contains(BodyId id) const override { return world_.Find(id) != nullptr; }
   BodyView View(BodyId id) const override;
   BodyPose Pose(BodyId id) const override;
+  BodyLook Look(BodyId id) const override;
   uint64_t Hash(BodyId id) const override;
   void Jointed(BodyId id, std::vector<BodyId>* out) const override;
 
   std::vector<BodyId> Ids() const override;
   void CollectOutside(const Rect& interior, double margin, std::vector<BodyId>* out) const override;
   void Query(const Box& box, std::vector<BodyId>* out) const override;
+  void AppendAwake(std::vector<BodyPose>* out) const override;
+  void AppendPoses(const Box& box, std::vector<BodyPose>* out) const override;
+  int64_t CountAwake() const override { return static_cast<int64_t>(world_.awake().size()); }
+  void NoteSleepers(bool on) override { world_.NoteFallen(on); }
+  void TakeSleepers(std::vector<BodyId>* out) override { world_.TakeFallen(out); }
   double MaxRadius() const override { return world_.max_radius(); }
 
   std::string Save(std::span<const BodyId> ids) const override;
@@ -122,12 +141,29 @@ BodyView BulletEngine::View(BodyId id) const {
   return view;
 }
 
-BodyPose BulletEngine::Pose(BodyId id) const {
+BodyPose BulletEngine::Pose(BodyId id) const { return PoseOf(*Get(id)); }
+
+BodyLook BulletEngine::Look(BodyId id) const {
   const Body& body = *Get(id);
-  const btTransform& at = body.rigid.getWorldTransform();
-  const btQuaternion turn = at.getRotation();
-  return {FromBullet(at.getOrigin()), Quat(turn.w(), turn.x(), turn.y(), turn.z()),
-          FromBullet(body.rigid.getLinearVelocity()), body.asleep, body.shape->source};
+  return {body.shape->source, body.mass, body.material};
+}
+
+void BulletEngine::AppendAwake(std::vector<BodyPose>* out) const {
+  const auto first = static_cast<std::ptrdiff_t>(out->size());
+  bool ascending = true;
+  BodyId last = 0;
+  for (const Body* b : world_.awake()) {
+    ascending &= last < b->id;
+    last = b->id;
+    out->push_back(PoseOf(*b));
+  }
+  if (!ascending) std::sort(out->begin() + first, out->end(), ById);
+}
+
+void BulletEngine::AppendPoses(const Box& box, std::vector<BodyPose>* out) const {
+  const auto first = static_cast<std::ptrdiff_t>(out->size());
+  world_.broadphase().Query(ToBullet(box.min), ToBullet(box.max), [out](const Body* b) { out->push_back(PoseOf(*b)); });
+  std::sort(out->begin() + first, out->end(), ById);
 }
 
 uint64_t BulletEngine::Hash(BodyId id) const {

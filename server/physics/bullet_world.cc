@@ -213,7 +213,18 @@ void BulletWorld::Wake(Body* body) {
   awake_unsorted_ = true;
 }
 
+void BulletWorld::NoteFallen(bool on) {
+  note_fallen_ = on;
+  fallen_.clear();
+}
+
+void BulletWorld::TakeFallen(std::vector<BodyId>* out) {
+  out->insert(out->end(), fallen_.begin(), fallen_.end());
+  fallen_.clear();
+}
+
 void BulletWorld::FallAsleep(Body* body) {
+  if (note_fallen_) fallen_.push_back(body->id);
   body->asleep = true;
   body->still = 0;
   body->rigid.setLinearVelocity(btVector3(0, 0, 0));

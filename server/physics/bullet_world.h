@@ -75,6 +75,10 @@ class BulletWorld {
   // A change from outside; wakes the body.
   void SetVelocities(Body* body, const btVector3& velocity, const btVector3& angular_velocity);
 
+  // From here on, bodies that fall asleep are noted; and those noted since the last call, appended.
+  void NoteFallen(bool on);
+  void TakeFallen(std::vector<BodyId>* out);
+
   void Step(Tick n);
   // Puts the kinematic bodies where they are after tick n. For a world without dynamic bodies.
   void SetTick(Tick n);
@@ -122,6 +126,8 @@ class BulletWorld {
   std::vector<Body*> awake_;  // all dynamic bodies that are not asleep; ascending ids unless awake_unsorted_
   bool awake_unsorted_ = false;
   double max_radius_ = 0;
+  bool note_fallen_ = false;
+  std::vector<BodyId> fallen_;
 
   // The rectangle that SleepersOutside was last asked for, and its answer.
   mutable Rect outside_of_;

@@ -115,7 +115,7 @@ TickLoop::Hooks Process::Hooks() {
   };
   hooks.inputs = [this] { return simulation.inputs().Take(); };
   hooks.outcomes = [this](const std::vector<InputOutcome>& outcomes) { simulation.inputs().Settle(outcomes); };
-  hooks.publish = [this](const Region& region, int64_t bodies) { simulation.Publish(region, bodies); };
+  hooks.publish = [this](Region* region, int64_t bodies) { simulation.AfterTick(region, bodies); };
   hooks.report = [this](const v1::Report& report) {
     if (metrics != nullptr) {
       metrics->Update(report);

@@ -180,7 +180,7 @@ void TickLoop::AfterTick() {
     out->set_depth(v.depth);
     out->set_speed(v.speed);
   }
-  hooks_.publish(*region_, bodies);
+  hooks_.publish(region_, bodies);
 }
 
 void TickLoop::Report(const std::vector<RegionId>& waiting_for, bool finished) {

@@ -30,7 +30,7 @@ class TickLoop {
     std::function<std::vector<Input>()> inputs;  // before each tick: what clients offer
     std::function<void(const std::vector<InputOutcome>&)> outcomes;
     std::function<void(const FrameSample&)> after_tick;
-    std::function<void(const Region&, int64_t bodies)> publish;  // after each tick
+    std::function<void(Region*, int64_t bodies)> publish;  // after each tick
     std::function<void(const v1::Report&)> report;
     std::function<void(const std::string&)> log;  // waits over 1 s, violations, refused frames
   };

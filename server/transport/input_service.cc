@@ -20,9 +20,6 @@ v1::WorldSpec NamesOf(const v1::WorldSpec& spec) {
   return out;
 }
 
-// Why it did not act. Precondition: !outcome.applied().
-v1::Reason ReasonOf(const InputOutcome& outcome) { return outcome.tick == 0 ? v1::FORGOTTEN : v1::NO_SUCH_BODY; }
-
 int64_t Copies(const v1::Array& a) {
   const auto along = [](int64_t n) { return std::clamp<int64_t>(n, 1, InputService::kMostPerMessage + 1); };
   return along(a.x()) * along(a.y()) * along(a.z());
@@ -38,6 +35,11 @@ void CheckNames(uint64_t client, uint64_t sequence, int64_t inputs, SpecCheck* c
 
 }  // namespace
 
+v1::Reason ReasonOf(const InputOutcome& outcome) {
+  if (outcome.applied()) return v1::REASON_UNSPECIFIED;
+  return outcome.tick == 0 ? v1::FORGOTTEN : v1::NO_SUCH_BODY;
+}
+
 void AddRejected(v1::Reason reason, uint64_t sequence, google::protobuf::RepeatedPtrField<v1::Rejected>* list) {
   auto it = std::find_if(list->begin(), list->end(), [reason](const v1::Rejected& r) { return r.reason() == reason; });
   if (it == list->end()) {
@@ -50,7 +52,7 @@ void AddRejected(v1::Reason reason, uint64_t sequence, google::protobuf::Repeate
 }
 
 // One ApplyImpulses call. Its fields are guarded by the service's mutex; deletes itself.
-class InputService::ImpulseStream final : public grpc::ServerReadReactor<v1::ImpulseBatch>, public Caller {
+class InputService::ImpulseStream final : public grpc::ServerReadReactor<v1::ImpulseBatch>, public InputCaller {
  public:
   ImpulseStream(InputService* service, v1::ImpulseSummary* summary) : service_(service), summary_(summary) {}
 
@@ -79,6 +81,10 @@ class InputService::ImpulseStream final : public grpc::ServerReadReactor<v1::Imp
     Continue();
   }
 
+  void Reject(v1::Reason reason, uint64_t sequence) override {
+    AddRejected(reason, sequence, summary_->mutable_rejected());
+  }
+
   void OnReadDone(bool ok) override {
     const std::lock_guard lock(service_->mutex_);
     reading_ = false;
@@ -86,9 +92,10 @@ class InputService::ImpulseStream final : public grpc::ServerReadReactor<v1::Imp
     if (!ok) {
       all_read_ = true;
     } else {
-      SpecCheck& check = service_->scene_->check = SpecCheck();
-      TakeBatch((Path() / "batch")[batches_], &check);
-      if (!check.ok()) return End(Refusal(check));
+      size_t taken = 0;
+      const grpc::Status refusal = service_->OfferLocked(this, (Path() / "batch")[batches_], batch_, &client_, &taken);
+      waiting_ += taken;
+      if (!refusal.ok()) return End(refusal);
     }
     ++batches_;
     Continue();
@@ -112,33 +119,6 @@ class InputService::ImpulseStream final : public grpc::ServerReadReactor<v1::Imp
     if (all_read_ && waiting_ == 0) End(grpc::Status::OK);
   }
 
-  // After a mistake, what came before it is taken.
-  void TakeBatch(const Path& path, SpecCheck* check) {
-    if (client_ == 0) client_ = batch_.client();
-    if (client_ == 0) check->Fail(path / "client", "must be given in the first batch, and not be 0", v1::MISSING);
-    if (batch_.client() != 0 && batch_.client() != client_) {
-      check->Fail(path / "client", "must not change within a stream", v1::CONFLICT);
-    }
-    if (batch_.impulse_size() > kMostPerMessage) {
-      check->Fail(path / "impulse", "must be at most 1024 in a batch; send more batches", v1::TOO_MANY);
-    }
-    for (int i = 0; i < batch_.impulse_size() && check->ok(); ++i) {
-      Input input = ReadImpulse((path / "impulse")[i], batch_.impulse(i), service_->scene_->tick_us, check);
-      if (!check->ok()) return;
-      input.source = client_;
-      Offer(std::move(input));
-    }
-  }
-
-  void Offer(Input input) {
-    const bool within = IsWithin(service_->scene_->limits, input);
-    if (!within || !service_->Allow(client_, static_cast<double>(input.ticks))) {
-      return AddRejected(within ? v1::RATE_LIMIT : v1::TOO_STRONG, input.sequence, summary_->mutable_rejected());
-    }
-    ++waiting_;
-    service_->Submit(this, std::move(input));
-  }
-
   InputService* const service_;
   v1::ImpulseSummary* const summary_;
   v1::ImpulseBatch batch_;
@@ -149,7 +129,7 @@ class InputService::ImpulseStream final : public grpc::ServerReadReactor<v1::Imp
 };
 
 // One call about bodies, each with a sequence of its own. As above.
-class InputService::BodiesCall : public grpc::ServerUnaryReactor, public Caller {
+class InputService::BodiesCall : public grpc::ServerUnaryReactor, public InputCaller {
  public:
   explicit BodiesCall(InputService* service) : service_(service) {}
 
@@ -170,6 +150,8 @@ class InputService::BodiesCall : public grpc::ServerUnaryReactor, public Caller 
     waiting_ = inputs.size();
     for (Input& i : inputs) service_->Submit(this, std::move(i));
   }
+
+  void Reject(v1::Reason, uint64_t) final {}  // all are refused together
 
   void Settle(const InputOutcome& outcome) final {
     if (ended_) return;
@@ -324,6 +306,51 @@ grpc::ServerUnaryReactor* InputService::RemoveBodies(const v1::RemoveBodiesReque
   return call;
 }
 
+bool InputService::Enter(InputCaller* caller) {
+  const std::lock_guard lock(mutex_);
+  if (scene_ == nullptr) return false;
+  callers_.insert(caller);
+  return true;
+}
+
+void InputService::Leave(InputCaller* caller) {
+  const std::lock_guard lock(mutex_);
+  Remove(caller);
+}
+
+grpc::Status InputService::Offer(InputCaller* caller, const Path& path, const v1::ImpulseBatch& batch, uint64_t* client,
+                                 size_t* taken) {
+  const std::lock_guard lock(mutex_);
+  if (scene_ == nullptr) return RegionGivenUp();
+  return OfferLocked(caller, path, batch, client, taken);
+}
+
+grpc::Status InputService::OfferLocked(InputCaller* caller, const Path& path, const v1::ImpulseBatch& batch,
+                                       uint64_t* client, size_t* taken) {
+  SpecCheck& check = scene_->check = SpecCheck();
+  if (*client == 0) *client = batch.client();
+  if (*client == 0) check.Fail(path / "client", "must be given in the first batch, and not be 0", v1::MISSING);
+  if (batch.client() != 0 && batch.client() != *client) {
+    check.Fail(path / "client", "must not change within a stream", v1::CONFLICT);
+  }
+  if (batch.impulse_size() > kMostPerMessage) {
+    check.Fail(path / "impulse", "must be at most 1024 in a batch; send more batches", v1::TOO_MANY);
+  }
+  for (int i = 0; i < batch.impulse_size() && check.ok(); ++i) {
+    Input input = ReadImpulse((path / "impulse")[i], batch.impulse(i), scene_->tick_us, &check);
+    if (!check.ok()) break;
+    input.source = *client;
+    const bool within = IsWithin(scene_->limits, input);
+    if (!within || !Allow(*client, static_cast<double>(input.ticks))) {
+      caller->Reject(within ? v1::RATE_LIMIT : v1::TOO_STRONG, input.sequence);
+      continue;
+    }
+    Submit(caller, std::move(input));
+    ++*taken;
+  }
+  return check.ok() ? grpc::Status::OK : Refusal(check);
+}
+
 void InputService::Serve(const v1::WorldSpec& spec, int64_t tick_us) {
   const std::lock_guard lock(mutex_);
   scene_ = std::make_unique<Scene>(spec, tick_us);
@@ -331,7 +358,7 @@ void InputService::Serve(const v1::WorldSpec& spec, int64_t tick_us) {
 
 void InputService::Stop() {
   const std::lock_guard lock(mutex_);
-  for (Caller* c : callers_) c->End(RegionGivenUp());
+  for (InputCaller* c : callers_) c->End(RegionGivenUp());
   scene_.reset();
 }
 
@@ -345,7 +372,7 @@ void InputService::Settle(const std::vector<InputOutcome>& outcomes) {
   for (const InputOutcome& o : outcomes) {
     const auto it = waiting_.find(o.name);
     if (it == waiting_.end()) continue;  // its call has ended
-    Caller* caller = it->second;
+    InputCaller* caller = it->second;
     waiting_.erase(it);
     caller->Settle(o);
   }
@@ -368,12 +395,12 @@ bool InputService::Allow(uint64_t client, double inputs) {
   return true;
 }
 
-void InputService::Submit(Caller* caller, Input input) {
+void InputService::Submit(InputCaller* caller, Input input) {
   waiting_.emplace(InputName{input.source, input.sequence}, caller);
   queue_.push_back(std::move(input));
 }
 
-void InputService::Remove(Caller* caller) {
+void InputService::Remove(InputCaller* caller) {
   callers_.erase(caller);
   std::erase_if(waiting_, [caller](const auto& e) { return e.second == caller; });
 }

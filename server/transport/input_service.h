@@ -21,6 +21,16 @@
 
 namespace aureole {
 
+// A call that waits for the outcomes of inputs. Both are called with the service's mutex held, and must not call back.
+class InputCaller {
+ public:
+  virtual ~InputCaller() = default;
+  virtual void Settle(const InputOutcome& outcome) = 0;
+  // An input that was rejected at once; its outcome does not follow.
+  virtual void Reject(v1::Reason reason, uint64_t sequence) = 0;
+  virtual void End(const grpc::Status& status) = 0;
+};
+
 class InputService {
  public:
   // Outcomes that one stream may wait for.
@@ -32,6 +42,15 @@ class InputService {
   grpc::ServerReadReactor<v1::ImpulseBatch>* ApplyImpulses(v1::ImpulseSummary* summary);
   grpc::ServerUnaryReactor* SpawnBodies(const v1::SpawnBodiesRequest& request, v1::SpawnBodiesResponse* response);
   grpc::ServerUnaryReactor* RemoveBodies(const v1::RemoveBodiesRequest& request, v1::RemoveBodiesResponse* response);
+
+  // For calls that bring inputs among others (Play). Between Enter and Leave the caller gets its outcomes, and its end.
+  // Enter: false when the server has no region.
+  bool Enter(InputCaller* caller);
+  void Leave(InputCaller* caller);
+  // Offers what is in the batch, up to the first mistake, whose refusal it returns. `*client` is 0 before the first.
+  // `taken`: how many outcomes follow.
+  grpc::Status Offer(InputCaller* caller, const Path& path, const v1::ImpulseBatch& batch, uint64_t* client,
+                     size_t* taken);
 
   // From here on inputs are taken, for this world.
   void Serve(const v1::WorldSpec& spec, int64_t tick_us);
@@ -45,13 +64,6 @@ class InputService {
  private:
   using Clock = std::chrono::steady_clock;
 
-  // A call that waits for outcomes. Guarded by the service's mutex.
-  class Caller {
-   public:
-    virtual ~Caller() = default;
-    virtual void Settle(const InputOutcome& outcome) = 0;
-    virtual void End(const grpc::Status& status) = 0;
-  };
   class ImpulseStream;
   class BodiesCall;
   class SpawnCall;
@@ -73,19 +85,23 @@ class InputService {
   };
 
   // All hold the mutex.
+  grpc::Status OfferLocked(InputCaller* caller, const Path& path, const v1::ImpulseBatch& batch, uint64_t* client,
+                           size_t* taken);
   bool Allow(uint64_t client, double inputs);
-  void Submit(Caller* caller, Input input);
-  void Remove(Caller* caller);
+  void Submit(InputCaller* caller, Input input);
+  void Remove(InputCaller* caller);
 
   std::mutex mutex_;
   std::unique_ptr<Scene> scene_;  // null: not serving
-  std::set<Caller*> callers_;
+  std::set<InputCaller*> callers_;
   std::vector<Input> queue_;
   // By input, the calls that wait for it; more than one when it was repeated.
-  std::multimap<InputName, Caller*> waiting_;
+  std::multimap<InputName, InputCaller*> waiting_;
   absl::flat_hash_map<uint64_t, Allowance> allowances_;
 };
 
+// Why it did not act; unspecified when it did.
+v1::Reason ReasonOf(const InputOutcome& outcome);
 // Counts rejections by reason, as messages list them.
 void AddRejected(v1::Reason reason, uint64_t sequence, google::protobuf::RepeatedPtrField<v1::Rejected>* list);
 

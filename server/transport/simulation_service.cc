@@ -1,166 +1,14 @@
 #include "server/transport/simulation_service.h"
 
-#include <cmath>
-#include <memory>
-#include <unordered_set>
-#include <utility>
-#include <vector>
+#include <algorithm>
+
+#include <grpcpp/impl/codegen/proto_utils.h>
 
 #include "server/transport/error_status.h"
+#include "server/transport/play_stream.h"
+#include "server/transport/replica_stream.h"
 
 namespace aureole {
-namespace {
-
-using Clock = std::chrono::steady_clock;
-
-constexpr double kDefaultRate = 20;
-constexpr double kMaxRate = 1000;
-
-void SetVec3(const Vec3& v, v1::Vec3* out) {
-  out->set_x(v.x());
-  out->set_y(v.y());
-  out->set_z(v.z());
-}
-
-// A state that is shared by all streams that are due at this tick.
-struct Snapshot {
-  v1::Replicas columns;  // without shapes
-  std::vector<BodyId> ids;
-  std::vector<std::shared_ptr<const Shape>> shapes;
-};
-
-std::shared_ptr<const Snapshot> TakeSnapshot(const Region& region) {
-  auto out = std::make_shared<Snapshot>();
-  v1::Replicas& c = out->columns;
-  const Engine& engine = region.engine();
-  out->ids = engine.Ids();
-  out->shapes.reserve(out->ids.size());
-  c.set_tick(region.tick());
-  c.set_region(region.self());
-  BodyId last = 0;
-  for (BodyId id : out->ids) {
-    const BodyPose pose = engine.Pose(id);
-    c.add_id(static_cast<int64_t>(id - std::exchange(last, id)));
-    const Eigen::Vector4f turn = pose.orientation.coeffs().cast<float>();
-    const Eigen::Vector3f velocity = pose.velocity.cast<float>();
-    c.mutable_position()->Add(pose.position.data(), pose.position.data() + 3);
-    c.mutable_orientation()->Add(turn.data(), turn.data() + 4);
-    c.mutable_velocity()->Add(velocity.data(), velocity.data() + 3);
-    c.add_asleep(pose.asleep);
-    out->shapes.push_back(pose.shape);
-  }
-  return out;
-}
-
-}  // namespace
-
-v1::Shape ShapeToProto(const Shape& shape) {
-  v1::Shape out;
-  switch (shape.kind) {
-    case ShapeKind::kSphere:
-      out.mutable_sphere()->set_radius(shape.radius);
-      break;
-    case ShapeKind::kBox:
-      SetVec3(2 * shape.half, out.mutable_box()->mutable_size());
-      break;
-    case ShapeKind::kCapsule:
-      out.mutable_capsule()->set_radius(shape.radius);
-      out.mutable_capsule()->set_height(2 * shape.half.y());
-      break;
-    case ShapeKind::kCylinder:
-      out.mutable_cylinder()->set_radius(shape.radius);
-      out.mutable_cylinder()->set_height(2 * shape.half.y());
-      break;
-    case ShapeKind::kHull:
-      for (const Vec3& p : shape.points) SetVec3(p, out.mutable_hull()->add_points());
-      break;
-    case ShapeKind::kCompound:
-      for (const ChildShape& child : shape.children) {
-        auto* c = out.mutable_compound()->add_children();
-        SetVec3(child.position, c->mutable_position());
-        c->mutable_orientation()->set_x(child.orientation.x());
-        c->mutable_orientation()->set_y(child.orientation.y());
-        c->mutable_orientation()->set_z(child.orientation.z());
-        c->mutable_orientation()->set_w(child.orientation.w());
-        *c->mutable_shape() = ShapeToProto(*child.shape);
-      }
-      break;
-    case ShapeKind::kPlane:
-    case ShapeKind::kMesh:
-    case ShapeKind::kHeightfield:
-      break;  // never of a dynamic body
-  }
-  return out;
-}
-
-// One StreamReplicas call. Its fields are guarded by the service's mutex; deletes itself.
-class SimulationService::Watcher final : public grpc::ServerWriteReactor<v1::Replicas> {
- public:
-  // Holds the mutex.
-  Watcher(SimulationService* service, double rate)
-      : service_(service),
-        period_(std::chrono::duration_cast<Clock::duration>(std::chrono::duration<double>(1 / rate))) {}
-
-  bool Due(Clock::time_point now) const { return !writing_ && !ended_ && now >= next_; }
-
-  void Write(const Snapshot& state, Clock::time_point now) {
-    // Keeps the rate on average, but never makes up for what the reader was too slow for.
-    next_ = std::max(next_ + period_, now);
-    out_ = state.columns;
-    std::unordered_set<BodyId> seen;
-    for (size_t i = 0; i < state.ids.size(); ++i) {
-      seen.insert(state.ids[i]);
-      if (seen_.contains(state.ids[i])) continue;
-      out_.add_shape_of(state.ids[i]);
-      *out_.add_shape() = ShapeToProto(*state.shapes[i]);
-    }
-    seen_ = std::move(seen);
-    writing_ = true;
-    StartWrite(&out_);
-  }
-
-  // No further write; finishes now, or when the write in flight is done.
-  void End(const grpc::Status& status) {
-    if (ended_) return;
-    ended_ = true;
-    verdict_ = status;
-    if (!writing_) Finish(verdict_);
-  }
-
-  void OnWriteDone(bool ok) override {
-    const std::lock_guard lock(service_->mutex_);
-    writing_ = false;
-    if (ended_) {
-      Finish(verdict_);
-    } else if (!ok) {
-      End(grpc::Status::CANCELLED);
-    }
-  }
-  void OnCancel() override {
-    const std::lock_guard lock(service_->mutex_);
-    End(grpc::Status::CANCELLED);
-  }
-  void OnDone() override {
-    {
-      const std::lock_guard lock(service_->mutex_);
-      service_->watchers_.erase(this);
-      --service_->watching_;
-    }
-    delete this;
-  }
-
- private:
-  SimulationService* const service_;
-  const Clock::duration period_;
-  Clock::time_point next_ = Clock::time_point::min();
-  bool writing_ = false, ended_ = false;
-  grpc::Status verdict_;
-  std::unordered_set<BodyId> seen_;  // in the message before
-  v1::Replicas out_;
-};
-
-SimulationService::SimulationService() = default;
-SimulationService::~SimulationService() = default;
 
 grpc::ServerUnaryReactor* SimulationService::GetWorld(grpc::CallbackServerContext* context, const v1::GetWorldRequest*,
                                                       v1::GetWorldResponse* response) {
@@ -177,21 +25,37 @@ grpc::ServerUnaryReactor* SimulationService::GetWorld(grpc::CallbackServerContex
   return reactor;
 }
 
-grpc::ServerWriteReactor<v1::Replicas>* SimulationService::StreamReplicas(grpc::CallbackServerContext*,
-                                                                          const v1::StreamReplicasRequest* request) {
-  const double rate = request->rate() == 0 ? kDefaultRate : request->rate();
-  const bool sane = std::isfinite(rate) && rate > 0 && rate <= kMaxRate;
-  const std::lock_guard lock(mutex_);
-  auto* watcher = new Watcher(this, sane ? rate : kDefaultRate);
-  watchers_.insert(watcher);
-  ++watching_;
-  if (!sane) {
-    watcher->End(Refusal(grpc::StatusCode::INVALID_ARGUMENT, v1::BAD_VALUE, "rate",
-                         "must be above 0 and at most 1000 per second, or 0 for 20"));
-  } else if (!serving_) {
-    watcher->End(NoRegion());
+grpc::ServerWriteReactor<grpc::ByteBuffer>* SimulationService::StreamReplicas(grpc::CallbackServerContext* context,
+                                                                              const grpc::ByteBuffer* request) {
+  using Refused = RefusedStream<grpc::ByteBuffer>;
+  grpc::ByteBuffer bytes = *request;
+  v1::StreamReplicasRequest message;
+  if (!grpc::SerializationTraits<v1::StreamReplicasRequest>::Deserialize(&bytes, &message).ok()) {
+    return new Refused(Refusal(grpc::StatusCode::INVALID_ARGUMENT, v1::BAD_VALUE, "",
+                               "must be a StreamReplicasRequest; these bytes are none"));
   }
-  return watcher;
+  int64_t tick_us = 0;
+  {
+    const std::lock_guard lock(mutex_);
+    if (!serving_) return new Refused(NoRegion());
+    tick_us = world_.tick_us();
+  }
+  SpecCheck check;
+  ReplicaRequest wanted = ReplicaRequest::Read(Path(), message, tick_us, &check);
+  if (!check.ok()) return new Refused(Refusal(check));
+  const std::shared_ptr<ReplicaStream> stream = ReplicaStream::Start(context, std::move(wanted));
+  replicas_.Join(stream);
+  return stream.get();
+}
+
+grpc::ServerBidiReactor<grpc::ByteBuffer, grpc::ByteBuffer>* SimulationService::Play(
+    grpc::CallbackServerContext* context) {
+  int64_t tick_us = 0;
+  {
+    const std::lock_guard lock(mutex_);
+    tick_us = world_.tick_us();
+  }
+  return PlayStream::Start(context, &inputs_, &replicas_, std::max<int64_t>(1, tick_us)).get();
 }
 
 grpc::ServerReadReactor<v1::ImpulseBatch>* SimulationService::ApplyImpulses(grpc::CallbackServerContext*,
@@ -213,6 +77,7 @@ grpc::ServerUnaryReactor* SimulationService::RemoveBodies(grpc::CallbackServerCo
 
 void SimulationService::Serve(const v1::Assignment& assignment, const World& world) {
   inputs_.Serve(assignment.world(), world.environment.tick_us);
+  replicas_.Serve(assignment.region(), assignment.layout_epoch(), world.environment.tick_us);
   const std::lock_guard lock(mutex_);
   serving_ = true;
   world_.Clear();
@@ -233,26 +98,15 @@ void SimulationService::Serve(const v1::Assignment& assignment, const World& wor
 
 void SimulationService::Stop() {
   inputs_.Stop();
+  replicas_.Stop(RegionGivenUp());
   const std::lock_guard lock(mutex_);
   serving_ = false;
-  for (Watcher* w : watchers_) w->End(RegionGivenUp());
 }
 
-void SimulationService::Publish(const Region& region, int64_t bodies) {
-  tick_ = region.tick();
+void SimulationService::AfterTick(Region* region, int64_t bodies) {
+  tick_ = region->tick();
   bodies_ = bodies;
-  if (watching_ == 0) return;
-  const Clock::time_point now = Clock::now();
-  const auto any_due = [&] {
-    const std::lock_guard lock(mutex_);
-    return std::any_of(watchers_.begin(), watchers_.end(), [&](const Watcher* w) { return w->Due(now); });
-  };
-  if (!any_due()) return;
-  const std::shared_ptr<const Snapshot> state = TakeSnapshot(region);
-  const std::lock_guard lock(mutex_);
-  for (Watcher* w : watchers_) {
-    if (w->Due(now)) w->Write(*state, now);
-  }
+  replicas_.AfterTick(region);
 }
 
 }  // namespace aureole

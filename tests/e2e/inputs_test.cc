@@ -11,6 +11,7 @@
 #include <vector>
 
 #include "aureole/v1/simulation.grpc.pb.h"
+#include "client/src/replica_decoder.h"
 #include "server/control/local_allocator.h"
 #include "server/control/run.h"
 
@@ -91,14 +92,16 @@ class Client {
   // Velocities along x of the bodies that this region owns.
   void AddVelocities(std::map<uint64_t, double>* out) {
     grpc::ClientContext context;
-    const auto stream = stub_->StreamReplicas(&context, {});
-    v1::Replicas state;
-    EXPECT_TRUE(stream->Read(&state));
-    uint64_t id = 0;
-    for (int i = 0; i < state.id_size(); ++i) {
-      id += static_cast<uint64_t>(state.id(i));
-      (*out)[id] = state.velocity(3 * i);
-    }
+    v1::StreamReplicasRequest request;
+    request.set_rate(1000);
+    request.set_precision(v1::EXACT);
+    const auto stream = stub_->StreamReplicas(&context, request);
+    v1::ReplicaFrame frame;
+    EXPECT_TRUE(stream->Read(&frame));
+    client::ReplicaDecoder decoder(v1::EXACT, false);
+    std::string error;
+    EXPECT_TRUE(decoder.Apply(frame, &error)) << error;
+    decoder.ForEach([&](uint64_t id) { (*out)[id] = decoder.Get(id).velocity[0]; });
     context.TryCancel();
     stream->Finish();
   }

@@ -94,9 +94,9 @@ class Cluster {
       hooks.inputs = [] { return std::vector<Input>(); };
       hooks.outcomes = [](const std::vector<InputOutcome>&) {};
       hooks.after_tick = [](const FrameSample&) {};
-      hooks.publish = [this](const Region& region, int64_t) {
+      hooks.publish = [this](Region* region, int64_t) {
         const std::lock_guard lock(mutex_);
-        progress_ = std::max(progress_, region.tick());
+        progress_ = std::max(progress_, region->tick());
         changed_.notify_all();
       };
       hooks.report = [this](const v1::Report& report) {

@@ -10,6 +10,7 @@
 #include <set>
 
 #include "aureole/v1/simulation.grpc.pb.h"
+#include "client/src/replica_decoder.h"
 #include "server/control/local_allocator.h"
 #include "server/control/run.h"
 #include "server/control/world_file.h"
@@ -165,26 +166,23 @@ TEST(RegionProcess, ServesHealthMetricsAndReplicasWhileItTicks) {
         v1::StreamReplicasRequest request;
         request.set_rate(50);
         const auto stream = stub->StreamReplicas(&watch, request);
-        std::set<uint64_t> known;
-        int64_t last_tick = 0;
+        client::ReplicaDecoder decoder(v1::FINE, false);
+        std::set<uint64_t> described;
         for (int n = 0; n < 5; ++n) {
-          v1::Replicas state;
-          EXPECT_TRUE(stream->Read(&state));
-          EXPECT_GT(state.tick(), last_tick);
-          last_tick = state.tick();
-          EXPECT_GT(state.id_size(), 0);
-          EXPECT_EQ(state.position_size(), 3 * state.id_size());
-          EXPECT_EQ(state.orientation_size(), 4 * state.id_size());
-          EXPECT_EQ(state.velocity_size(), 3 * state.id_size());
-          EXPECT_EQ(state.asleep_size(), state.id_size());
-          EXPECT_EQ(state.shape_size(), state.shape_of_size());
-          EXPECT_TRUE(n > 0 || state.shape_size() == state.id_size());
-          for (uint64_t id : state.shape_of()) EXPECT_TRUE(known.insert(id).second || n > 0);
-          uint64_t id = 0;
-          for (int64_t step : state.id()) {
-            id += static_cast<uint64_t>(step);
-            EXPECT_TRUE(known.contains(id)) << "no shape of body " << id;
+          v1::ReplicaFrame frame;
+          EXPECT_TRUE(stream->Read(&frame));
+          EXPECT_EQ(frame.region(), 2);
+          EXPECT_GT(frame.tick(), decoder.tick());
+          std::string error;
+          EXPECT_TRUE(decoder.Apply(frame, &error)) << error;
+          for (const v1::BodyDescription& d : frame.described()) {
+            EXPECT_NE(d.shape().kind_case(), v1::Shape::KIND_NOT_SET);
+            EXPECT_GT(d.mass(), 0);
+            uint64_t id = 0;
+            for (uint64_t step : d.body()) described.insert(id += step);
           }
+          EXPECT_GT(decoder.bodies(), 0u);
+          decoder.ForEach([&](uint64_t id) { EXPECT_TRUE(described.contains(id)) << "no shape of body " << id; });
         }
         watch.TryCancel();
         stream->Finish();

@@ -1,0 +1,47 @@
+// One world from the streams of all its servers: each body once, by its epoch, however its servers' frames overtake
+// each other.
+#pragma once
+
+#include <cstdint>
+#include <unordered_map>
+#include <vector>
+
+#include "client/src/replica_decoder.h"
+
+namespace aureole::client {
+
+struct MergedBody {
+  int32_t region = -1;  // whose stream told it
+  int64_t tick = 0;     // when the state was told or, of a body at rest, last changed
+  ToldBody state;
+};
+
+class ReplicaMerger {
+ public:
+  // After `decoder`, of this region's stream, has taken a frame.
+  void Apply(int32_t region, const ReplicaDecoder& decoder);
+  // The stream of this region has ended: what it told is not known any more, once `decoder` (that of a new stream to
+  // the same region, or null) lacks it.
+  void Forget(int32_t region);
+
+  const std::unordered_map<uint64_t, MergedBody>& bodies() const { return bodies_; }
+  // Of the last Apply or Forget: bodies that are gone from the merged world.
+  const std::vector<LostBody>& lost() const { return lost_; }
+
+ private:
+  // A body that its server handed over and whose new server has not told it yet: it stays as it was.
+  struct Transit {
+    int32_t region = -1;
+    uint32_t epoch = 0;
+    int64_t tick = 0;
+  };
+  void Settle(int32_t region, const ReplicaDecoder& decoder);
+  void Lose(const LostBody& lost);
+
+  std::unordered_map<uint64_t, MergedBody> bodies_;
+  std::unordered_map<uint64_t, Transit> transits_;
+  std::unordered_map<int32_t, int64_t> ticks_;  // of each region's last frame
+  std::vector<LostBody> lost_;
+};
+
+}  // namespace aureole::client

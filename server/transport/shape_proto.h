@@ -1,0 +1,12 @@
+// Shapes and materials as clients see them, in the terms of a world file.
+#pragma once
+
+#include "aureole/v1/world.pb.h"
+#include "server/core/scene.h"
+
+namespace aureole {
+
+v1::Shape ShapeToProto(const Shape& shape);
+v1::Material MaterialToProto(const Material& material);
+
+}  // namespace aureole
