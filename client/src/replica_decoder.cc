@@ -175,13 +175,13 @@ bool ReplicaDecoder::Change(const v1::Cell& in, Cell* cell) {
 }
 
 bool ReplicaDecoder::ReadBits(const std::string& bits, Cell* cell) {
-  static constexpr int kPose[] = {4, 8, 13, 32}, kVelocity[] = {0, 6, 10, 32};
+  static constexpr int kWidths[] = {0, 4, 6, 8, 10, 12, 14, 32};
   BitReader reader(bits);
   for (Entry& e : *cell) {
     if (reader.Read(1) == 0) continue;
     changed_.push_back(e.id);
     for (size_t k = 0; k < (velocities_ ? 12 : 6); k += 3) {
-      const int width = (k < 6 ? kPose : kVelocity)[reader.Read(2)];
+      const int width = kWidths[reader.Read(3)];
       for (size_t i = k; i < k + 3; ++i) e.integers[i] = Plus(e.integers[i], reader.ReadSigned(width));
     }
   }

@@ -51,7 +51,8 @@ class BitWriter {
   size_t size_ = 0, used_ = 0;
 };
 
-constexpr std::array<int, 4> kPoseBits{4, 8, 13, 32}, kVelocityBits{0, 6, 10, 32};
+// That a vector is told in; all three components in the same.
+constexpr std::array<int, 8> kWidths{0, 4, 6, 8, 10, 12, 14, 32};
 
 bool Fits(int32_t value, int bits) {
   if (bits >= 32) return true;
@@ -59,11 +60,11 @@ bool Fits(int32_t value, int bits) {
   return bits == 0 ? value == 0 : value >= -most && value < most;
 }
 
-void AddVector(const int32_t* d, const std::array<int, 4>& widths, BitWriter* out) {
+void AddVector(const int32_t* d, BitWriter* out) {
   uint32_t choice = 0;
-  while (!Fits(d[0], widths[choice]) || !Fits(d[1], widths[choice]) || !Fits(d[2], widths[choice])) ++choice;
-  out->Add(choice, 2);
-  for (int i = 0; i < 3; ++i) out->Add(static_cast<uint32_t>(d[i]), widths[choice]);
+  while (!Fits(d[0], kWidths[choice]) || !Fits(d[1], kWidths[choice]) || !Fits(d[2], kWidths[choice])) ++choice;
+  out->Add(choice, 3);
+  for (int i = 0; i < 3; ++i) out->Add(static_cast<uint32_t>(d[i]), kWidths[choice]);
 }
 
 // Differences of all integers: position, orientation, velocities.
@@ -166,9 +167,7 @@ class Encoder {
     if (format_.layout == CellLayout::kBits) {
       bits_.Add(changed ? 1 : 0, 1);
       if (!changed) return;
-      for (int k = 0; k < (format_.velocities ? 12 : 6); k += 3) {
-        AddVector(&d[static_cast<size_t>(k)], k < 6 ? kPoseBits : kVelocityBits, &bits_);
-      }
+      for (size_t k = 0; k < (format_.velocities ? 12 : 6); k += 3) AddVector(&d[k], &bits_);
     } else if (changed) {
       id_.Add(y.id);
       out_.mutable_position()->Add(&d[0], &d[3]);

@@ -1,25 +1,17 @@
-// aureole-bench: measurements that decide design questions. Every one prints a state hash beside its times.
+// aureole-bench: measurements that decide design questions. Every one prints a state hash beside its figures.
 #include <cinttypes>
 #include <cstdio>
 
 #include <CLI/CLI.hpp>
 
+#include "tests/bench/client_bytes.h"
 #include "tests/bench/overhead.h"
 
-int main(int argc, char** argv) {
-  CLI::App app("Benchmarks of Aureole.");
-  app.require_subcommand(1);
-  bool json = false;
-  aureole::OverheadOptions options;
-  CLI::App* overhead = app.add_subcommand("overhead", "One region against stock Bullet float64 on the same heap.");
-  overhead->add_flag("--json", json, "One JSON object instead of text");
-  overhead->add_option("--bodies", options.bodies, "Bodies in the heap")->check(CLI::Range(1, 100000));
-  overhead->add_option("--warm-up", options.warm_up, "Ticks before measuring")->check(CLI::Range(0, 1000000));
-  overhead->add_option("--blocks", options.blocks, "Measured blocks of each world")->check(CLI::Range(1, 100000));
-  overhead->add_option("--block", options.block, "Ticks of a block")->check(CLI::Range(1, 100000));
-  CLI11_PARSE(app, argc, argv);
+namespace aureole {
+namespace {
 
-  const aureole::OverheadResult r = aureole::MeasureOverhead(options);
+void PrintOverhead(const OverheadOptions& options, bool json) {
+  const OverheadResult r = MeasureOverhead(options);
   const char* format =
       json ? "{\"ratio_median\": %.4f, \"ratio_quartiles\": [%.4f, %.4f], \"region_ms\": %.4f, \"stock_ms\": %.4f, "
              "\"bodies\": %d, \"region_contacts\": %" PRId64 ", \"stock_contacts\": %" PRId64
@@ -29,5 +21,56 @@ int main(int argc, char** argv) {
              "; %d blocks of %d ticks each\nstate hash %016" PRIx64 "\n";
   std::printf(format, r.ratio_median, r.ratio_low, r.ratio_high, r.region_ms, r.stock_ms, options.bodies,
               r.region_contacts, r.stock_contacts, options.blocks, options.block, r.state_hash);
+}
+
+void PrintClientBytes(const ClientBytesOptions& options, bool json) {
+  const ClientBytesResult r = MeasureClientBytes(options);
+  if (json) std::printf("{\"rows\": [");
+  if (!json) std::printf("scene        encoding  every  moving  bytes/body/frame   kbit/s\n");
+  const char* separator = "";
+  for (const ClientBytesRow& row : r.rows) {
+    if (json) {
+      std::printf(
+          "%s{\"scene\": \"%s\", \"encoding\": \"%s\", \"period\": %d, \"moving\": %.4f, \"bytes_per_body\": %.4f, "
+          "\"kbit_per_s\": %.1f}",
+          separator, row.scene.c_str(), row.encoding.c_str(), row.period, row.moving, row.bytes_per_body,
+          row.kbit_per_s);
+      separator = ", ";
+    } else {
+      std::printf("%-12s %-8s %6d  %5.1f%%  %16.3f %8.1f\n", row.scene.c_str(), row.encoding.c_str(), row.period,
+                  100 * row.moving, row.bytes_per_body, row.kbit_per_s);
+    }
+  }
+  std::printf(json ? "], \"quiet_seconds\": %d, \"quiet_kbit_per_s\": %.1f, \"state_hash\": \"%016" PRIx64 "\"}\n"
+                   : "901 cubes, seconds in which at most 4 %% move: %d, at most %.1f kbit/s\nstate hash %016" PRIx64
+                     "\n",
+              r.quiet_seconds, r.quiet_kbit_per_s, r.state_hash);
+}
+
+int Run(int argc, char** argv) {
+  CLI::App app("Benchmarks of Aureole.");
+  app.require_subcommand(1);
+  bool json = false;
+  OverheadOptions overhead_options;
+  CLI::App* overhead = app.add_subcommand("overhead", "One region against stock Bullet float64 on the same heap.");
+  overhead->add_flag("--json", json, "One JSON object instead of text");
+  overhead->add_option("--bodies", overhead_options.bodies, "Bodies in the heap")->check(CLI::Range(1, 100000));
+  overhead->add_option("--warm-up", overhead_options.warm_up, "Ticks before measuring")->check(CLI::Range(0, 1000000));
+  overhead->add_option("--blocks", overhead_options.blocks, "Measured blocks of each world")
+      ->check(CLI::Range(1, 100000));
+  overhead->add_option("--block", overhead_options.block, "Ticks of a block")->check(CLI::Range(1, 100000));
+  ClientBytesOptions bytes_options;
+  CLI::App* bytes = app.add_subcommand("clients", "Bytes of replicas per body and frame, poses only, precision FINE.");
+  bytes->add_flag("--json", json, "One JSON object instead of text");
+  bytes->add_option("--bodies", bytes_options.bodies, "Bodies of a scene")->check(CLI::Range(1, 100000));
+  bytes->add_option("--ticks", bytes_options.ticks, "Measured ticks of a scene")->check(CLI::Range(60, 1000000));
+  CLI11_PARSE(app, argc, argv);
+  if (overhead->parsed()) PrintOverhead(overhead_options, json);
+  if (bytes->parsed()) PrintClientBytes(bytes_options, json);
   return 0;
 }
+
+}  // namespace
+}  // namespace aureole
+
+int main(int argc, char** argv) { return aureole::Run(argc, argv); }
