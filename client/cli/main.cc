@@ -5,6 +5,7 @@
 #include "client/cli/check.h"
 #include "client/cli/exit_codes.h"
 #include "client/cli/experiment.h"
+#include "client/cli/load.h"
 #include "client/cli/up.h"
 #include "server/control/interrupts.h"
 
@@ -24,8 +25,10 @@ int main(int argc, char** argv) {
   aureole::UpOptions up_options;
   aureole::ExperimentOptions experiment_options;
   aureole::CheckOptions check_options;
+  aureole::LoadOptions load_options;
   const CLI::App* up = aureole::AddUp(app, &up_options);
   const CLI::App* experiment = aureole::AddExperiment(app, &experiment_options);
+  const CLI::App* load = aureole::AddLoad(app, &load_options);
   aureole::AddCheck(app, &check_options);
   try {
     app.parse(argc, argv);
@@ -34,5 +37,6 @@ int main(int argc, char** argv) {
   }
   if (up->parsed()) return aureole::Up(up_options);
   if (experiment->parsed()) return aureole::RunExperiment(experiment_options);
+  if (load->parsed()) return aureole::RunLoad(load_options);
   return aureole::Check(check_options);
 }

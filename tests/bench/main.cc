@@ -5,6 +5,7 @@
 #include <CLI/CLI.hpp>
 
 #include "tests/bench/client_bytes.h"
+#include "tests/bench/fan_out.h"
 #include "tests/bench/overhead.h"
 
 namespace aureole {
@@ -47,6 +48,18 @@ void PrintClientBytes(const ClientBytesOptions& options, bool json) {
               r.quiet_seconds, r.quiet_kbit_per_s, r.state_hash);
 }
 
+int PrintFanOut(const FanOutOptions& options, bool json) {
+  const FanOutResult r = MeasureFanOut(options);
+  if (!r.ok) return 1;
+  std::printf(json
+                  ? "{\"clients\": %d, \"bodies\": %d, \"cores\": %.4f, \"tick_p99_ratio\": %.4f, "
+                    "\"tick_p99_ms\": %.4f, \"base_cores\": %.4f}\n"
+                  : "%d clients of one view of %d moving bodies at 60 Hz cost %.3f cores of the region server\n"
+                    "tick thread, p99: %.3f of what it is without them (%.3f ms; server without clients: %.3f cores)\n",
+              options.clients, options.bodies, r.cores, r.tick_p99_ratio, r.tick_p99_ms, r.base_cores);
+  return 0;
+}
+
 int Run(int argc, char** argv) {
   CLI::App app("Benchmarks of Aureole.");
   app.require_subcommand(1);
@@ -64,9 +77,17 @@ int Run(int argc, char** argv) {
   bytes->add_flag("--json", json, "One JSON object instead of text");
   bytes->add_option("--bodies", bytes_options.bodies, "Bodies of a scene")->check(CLI::Range(1, 100000));
   bytes->add_option("--ticks", bytes_options.ticks, "Measured ticks of a scene")->check(CLI::Range(60, 1000000));
+  FanOutOptions fan_out_options;
+  CLI::App* fan_out = app.add_subcommand("fan-out", "Clients that share one view, on real processes.");
+  fan_out->add_flag("--json", json, "One JSON object instead of text");
+  fan_out->add_option("--clients", fan_out_options.clients, "Clients")->check(CLI::Range(1, 10000));
+  fan_out->add_option("--bodies", fan_out_options.bodies, "Bodies in view")->check(CLI::Range(1, 100000));
+  fan_out->add_option("--blocks", fan_out_options.blocks, "Blocks of 10 s with and without clients")
+      ->check(CLI::Range(1, 1000));
   CLI11_PARSE(app, argc, argv);
   if (overhead->parsed()) PrintOverhead(overhead_options, json);
   if (bytes->parsed()) PrintClientBytes(bytes_options, json);
+  if (fan_out->parsed()) return PrintFanOut(fan_out_options, json);
   return 0;
 }
 
