@@ -103,7 +103,14 @@ std::vector<std::string> TableLines(const Heading& heading, const RunStatus& sta
                            total.violations));
   const std::vector<std::string> waiting = status.Waiting();
   lines.push_back(waiting.empty() ? "" : absl::StrCat("waiting: ", absl::StrJoin(waiting, "; ")));
+  lines.push_back(ServersLine(status));
   return lines;
+}
+
+std::string ServersLine(const RunStatus& status) {
+  std::vector<std::string> endpoints;
+  for (const RegionStatus& r : status.regions) endpoints.push_back(r.endpoint);
+  return absl::StrCat("servers: ", absl::StrJoin(endpoints, " "));
 }
 
 std::string PlainLine(const Heading& heading, const RunStatus& status) {

@@ -18,6 +18,8 @@ struct Heading {
 // One row per region, a row of totals, and what the run waits for. Frame times are those of the last second.
 std::vector<std::string> TableLines(const Heading& heading, const RunStatus& status);
 std::string PlainLine(const Heading& heading, const RunStatus& status);
+// Where clients reach the region servers, in order.
+std::string ServersLine(const RunStatus& status);
 
 // "4.2 kB", "17 MB"; powers of 1000.
 std::string HumanBytes(double bytes);

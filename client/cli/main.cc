@@ -2,11 +2,13 @@
 #include <CLI/CLI.hpp>
 #include <string>
 
+#include "client/cli/act.h"
 #include "client/cli/check.h"
 #include "client/cli/exit_codes.h"
 #include "client/cli/experiment.h"
 #include "client/cli/load.h"
 #include "client/cli/up.h"
+#include "client/cli/watch.h"
 #include "server/control/interrupts.h"
 
 int main(int argc, char** argv) {
@@ -19,6 +21,7 @@ int main(int argc, char** argv) {
                          "  aureole up tests/worlds/demo.json\n"
                          "  aureole experiment tests/worlds/paper/column-*.json\n"
                          "  aureole check tests/worlds/*.json\n"
+                         "  aureole watch --server 127.0.0.1:40001\n"
                          "  aureole up --help\n\n") +
              aureole::kExitCodesHelp);
 
@@ -26,8 +29,16 @@ int main(int argc, char** argv) {
   aureole::ExperimentOptions experiment_options;
   aureole::CheckOptions check_options;
   aureole::LoadOptions load_options;
+  aureole::PushOptions push_options;
+  aureole::SpawnOptions spawn_options;
+  aureole::RemoveOptions remove_options;
+  aureole::WatchCliOptions watch_options;
   const CLI::App* up = aureole::AddUp(app, &up_options);
   const CLI::App* experiment = aureole::AddExperiment(app, &experiment_options);
+  const CLI::App* watch = aureole::AddWatch(app, &watch_options);
+  const CLI::App* push = aureole::AddPush(app, &push_options);
+  const CLI::App* spawn = aureole::AddSpawn(app, &spawn_options);
+  const CLI::App* remove = aureole::AddRemove(app, &remove_options);
   const CLI::App* load = aureole::AddLoad(app, &load_options);
   aureole::AddCheck(app, &check_options);
   try {
@@ -37,6 +48,10 @@ int main(int argc, char** argv) {
   }
   if (up->parsed()) return aureole::Up(up_options);
   if (experiment->parsed()) return aureole::RunExperiment(experiment_options);
+  if (watch->parsed()) return aureole::RunWatch(watch_options);
+  if (push->parsed()) return aureole::RunPush(push_options);
+  if (spawn->parsed()) return aureole::RunSpawn(spawn_options);
+  if (remove->parsed()) return aureole::RunRemove(remove_options);
   if (load->parsed()) return aureole::RunLoad(load_options);
   return aureole::Check(check_options);
 }

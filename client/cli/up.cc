@@ -4,6 +4,7 @@
 
 #include <cstdio>
 #include <iostream>
+#include <utility>
 
 #include <absl/strings/str_format.h>
 #include <nlohmann/json.hpp>
@@ -41,6 +42,9 @@ class Display {
     if (terminal_) {
       screen_.Draw(TableLines(heading_, status));
     } else {
+      if (status.stage >= Stage::kRunning && !std::exchange(named_, true)) {
+        std::printf("%s\n", ServersLine(status).c_str());
+      }
       std::printf("%s\n", PlainLine(heading_, status).c_str());
     }
     return std::fflush(stdout) == 0;
@@ -49,6 +53,7 @@ class Display {
  private:
   const Heading heading_;
   const bool quiet_, terminal_;
+  bool named_ = false;  // the servers
   Screen screen_{stdout};
   Clock::time_point next_{};
 };

@@ -1,5 +1,7 @@
 #include "client/src/replica_merger.h"
 
+#include <algorithm>
+
 namespace aureole::client {
 
 void ReplicaMerger::Apply(int32_t region, const ReplicaDecoder& decoder) {
@@ -10,7 +12,14 @@ void ReplicaMerger::Apply(int32_t region, const ReplicaDecoder& decoder) {
     const auto [it, fresh] = bodies_.try_emplace(id);
     MergedBody& body = it->second;
     if (!fresh && told.epoch < body.state.epoch) continue;  // a late word of a former server
-    body = {region, decoder.tick(), told};
+    const int64_t held = body.region == region ? ticks_[region] : 0;
+    if (!fresh) {
+      std::shift_right(body.before.begin(), body.before.end(), 1);
+      body.before[0] = {std::max(body.tick, held), body.state};
+    }
+    body.region = region;
+    body.tick = decoder.tick();
+    body.state = told;
     const auto transit = transits_.find(id);
     if (transit != transits_.end() && told.epoch >= transit->second.epoch) transits_.erase(transit);
   }
@@ -38,17 +47,13 @@ void ReplicaMerger::Settle(int32_t region, const ReplicaDecoder& decoder) {
   for (const LostBody& l : gone) Lose(l);
 }
 
-void ReplicaMerger::Forget(int32_t region) {
+void ReplicaMerger::Reconcile(int32_t region, const ReplicaDecoder& decoder) {
   lost_.clear();
   std::vector<LostBody> gone;
   for (const auto& [id, body] : bodies_) {
-    if (body.region == region && !transits_.contains(id)) gone.push_back({id});
-  }
-  for (const auto& [id, t] : transits_) {
-    if (t.region == region) gone.push_back({id});
+    if (body.region == region && !transits_.contains(id) && !decoder.Contains(id)) gone.push_back({id});
   }
   for (const LostBody& l : gone) Lose(l);
-  ticks_.erase(region);
 }
 
 void ReplicaMerger::Lose(const LostBody& lost) {

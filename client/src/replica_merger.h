@@ -2,6 +2,7 @@
 // each other.
 #pragma once
 
+#include <array>
 #include <cstdint>
 #include <unordered_map>
 #include <vector>
@@ -14,18 +15,24 @@ struct MergedBody {
   int32_t region = -1;  // whose stream told it
   int64_t tick = 0;     // when the state was told or, of a body at rest, last changed
   ToldBody state;
+  // States before, the latest first, each with the last tick at which it is known to have held; tick 0: none.
+  struct Before {
+    int64_t tick = 0;
+    ToldBody state;
+  };
+  std::array<Before, 4> before{};
 };
 
 class ReplicaMerger {
  public:
   // After `decoder`, of this region's stream, has taken a frame.
   void Apply(int32_t region, const ReplicaDecoder& decoder);
-  // The stream of this region has ended: what it told is not known any more, once `decoder` (that of a new stream to
-  // the same region, or null) lacks it.
-  void Forget(int32_t region);
+  // After a new stream to this region has told all that is in view: what the old one told and the new one does not have
+  // is gone.
+  void Reconcile(int32_t region, const ReplicaDecoder& decoder);
 
   const std::unordered_map<uint64_t, MergedBody>& bodies() const { return bodies_; }
-  // Of the last Apply or Forget: bodies that are gone from the merged world.
+  // Of the last Apply or Reconcile: bodies that are gone from the merged world.
   const std::vector<LostBody>& lost() const { return lost_; }
 
  private:

@@ -45,7 +45,7 @@ class LiveInputs {
   // Most inputs that a region tells in one tick; more wait for the next.
   static constexpr size_t kMostPerTick = 1024;
   // Outcomes kept of each source, for what it repeats, and ticks after which those of a source that says nothing go.
-  static constexpr size_t kKeptOutcomes = 1024;
+  static constexpr size_t kKeptOutcomes = 8192;
   static constexpr Tick kKeptTicks = 4096;
 
   // Takes an input for the next exchange, after CheckLiveInput.

@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 import termios
+import threading
 import time
 import unittest
 
@@ -113,7 +114,7 @@ class Terminal(Cli):
             if select.select([master], [], [], 1)[0]:
                 text += os.read(master, 65536)
         self.assertGreaterEqual(text.count(b"demo: running, 4 regions"), 2)
-        self.assertIn(b"\x1b[9A", text)  # nine lines up, over what was drawn before
+        self.assertIn(b"\x1b[10A", text)  # ten lines up, over what was drawn before
         for word in (b"region ", b"awake", b"asleep", b"p99 ms", b"transfers", b"waits", b"violations", b"all "):
             self.assertIn(word, text)
         servers = self.servers_of(process, 4)
@@ -223,11 +224,76 @@ class Input(Cli):
         self.assertTrue(err.startswith(str(broken)))
 
     def test_help_has_examples_and_exit_codes(self):
-        for command in ([], ["up"], ["experiment"], ["check"]):
+        for command in ([], ["up"], ["experiment"], ["check"], ["watch"], ["push"], ["spawn"], ["remove"], ["load"]):
             code, out, _ = self.run_cli(*command, "--help")
             self.assertEqual(code, 0)
             self.assertIn("Example", out)
-            self.assertIn("Exit codes: 0 fine; 1", out)
+            self.assertIn("Exit codes: 0 ", out)
+
+
+class Clients(Cli):
+    def setUp(self):
+        super().setUp()
+        up = self.start("up", WORLDS / "demo.json")
+        line = ""
+        while not line.startswith("servers: "):
+            line = up.stdout.readline()
+            self.assertTrue(line, "the run ended")
+        self.servers = line.split()[1:]
+        # Read on, so that the run is not held up.
+        threading.Thread(target=up.stdout.read, daemon=True).start()
+        self.up = up
+
+    def tearDown(self):
+        self.up.send_signal(signal.SIGINT)
+        self.up.wait(DEADLINE_S)
+        super().tearDown()
+
+    def ask(self, command, *arguments, server=0, code=0):
+        got, out, err = self.run_cli(command, "--server", self.servers[server], *arguments)
+        self.assertEqual(got, code, out + err)
+        return out, err
+
+    def bodies(self, *arguments, server=0):
+        shown = json.loads(self.ask("watch", "--bodies", "--json", *arguments, server=server)[0])
+        return {b["body"]: b for b in shown["bodies"]}
+
+    def test_body_is_spawned_seen_pushed_and_removed_by_any_server(self):
+        self.assertEqual(len(self.servers), 4)
+        before = self.bodies()
+        self.assertGreater(len(before), 200)
+        spawned = int(self.ask("spawn", "--shape", "box:1,1,1", "--mass", 5, "--position", "0,50,0", server=1)[0])
+        self.assertNotIn(spawned, before)
+        body = self.bodies(server=2)[spawned]
+        self.assertLess(body["position"][1], 50.1)
+        out, _ = self.ask("push", "--body", spawned, "--velocity", "0,100,0", "--json", server=3)
+        self.assertEqual(json.loads(out), {"applied": 1, "bodies": 1, "rejected": {}})
+        self.assertGreater(self.bodies("--rect", "-9,9,-9,9")[spawned]["velocity"][1], 20)
+        self.assertNotIn(spawned, self.bodies("--sphere", "300,300,10"))
+        self.assertEqual(self.ask("remove", spawned, server=2)[0], "1 of 1 removed\n")
+        self.assertEqual(self.ask("remove", spawned, code=1)[0], "0 of 1 removed\n")
+        self.assertIn("NO_SUCH_BODY", self.ask("push", "--body", spawned, "--velocity", "0,1,0", code=1)[0])
+
+    def test_many_clients_get_their_frames(self):
+        out, _ = self.ask("load", "--clients", 10, "--duration", "2s", "--rate", 30, "--push-rate", 100, "--json")
+        load = json.loads(out)
+        self.assertEqual(load["streams"], 40)
+        self.assertEqual(load["failed_streams"], 0)
+        self.assertGreater(load["least_frames_per_second"], 15)
+        self.assertGreater(load["pushes"]["applied"], 50)
+
+    def test_bad_input_is_named(self):
+        for arguments, word in ((["spawn", "--shape", "cube:1", "--position", "0,0,0"], "--shape"),
+                                (["spawn", "--shape", "sphere:-1", "--position", "0,0,0"], "bodies[0].shape.sphere"),
+                                (["push", "--body", "3", "--impulse", "1,2"], "--impulse"),
+                                (["push", "--body", "3", "--force", "0,1,0"], ""),
+                                (["push", "--sphere", "0,0,0,5"], "--impulse"),
+                                (["watch", "--rect", "5,-5,0,1"], "rect")):
+            _, err = self.ask(arguments[0], *arguments[1:], code=2)
+            self.assertIn(word, err)
+        code, _, err = self.run_cli("watch", "--server", "127.0.0.1:1")
+        self.assertEqual(code, 2)
+        self.assertIn("--server", err)
 
 
 class Results(Cli):

@@ -12,7 +12,9 @@
 #include "client/src/replica_decoder.h"
 #include "client/src/replica_merger.h"
 #include "server/core/toy_engine.h"
+#include "server/physics/bullet_engine.h"
 #include "server/transport/replica_publisher.h"
+#include "server/transport/world_spec.h"
 #include "tests/simulation/lockstep.h"
 #include "tests/simulation/random.h"
 #include "tests/simulation/scenario.h"
@@ -86,7 +88,9 @@ ReplicaRequest Read(const v1::StreamReplicasRequest& message, int64_t tick_us) {
 // One client that watches every region of a world in lock-step.
 class Watched {
  public:
-  Watched(World world, const v1::StreamReplicasRequest& request) : split_(std::move(world)), message_(request) {
+  Watched(World world, const v1::StreamReplicasRequest& request,
+          std::unique_ptr<Engine> (*make)(const Environment&) = MakeToyEngine)
+      : split_(std::move(world), make), message_(request) {
     const int n = split_.world().layout.size();
     for (RegionId r = 0; r < n; ++r) {
       publishers_.push_back(std::make_unique<ReplicaPublisher>());
@@ -158,9 +162,16 @@ double VelocityOff(const ToldBody& told, const BodyPose& truth) {
   return (Vec3(told.velocity[0], told.velocity[1], told.velocity[2]) - truth.velocity).cwiseAbs().maxCoeff();
 }
 
+// In degrees.
+double Turned(const ToldBody& told, const BodyPose& truth) {
+  const auto& q = told.orientation;
+  return truth.orientation.angularDistance(Quat(q[3], q[0], q[1], q[2])) * 180 / 3.14159265358979323846;
+}
+
 // Every body of the region, each once, as it was.
 void ExpectSameState(Watched* w, RegionId r, const v1::StreamReplicasRequest& request) {
-  static constexpr double kMetres[] = {0.5e-3, 7e-3, 0}, kSpeed[] = {1.0 / 128, 1.0 / 16, 0};
+  static constexpr double kMetres[] = {0.5e-3, 7e-3, 0}, kDegrees[] = {0.05, 0.4, 1e-5},
+                          kSpeed[] = {1.0 / 128, 1.0 / 16, 0};
   const auto& truth = w->Truth(r);
   ReplicaDecoder& decoder = w->decoder(r);
   ASSERT_EQ(decoder.bodies(), truth.size()) << "region " << r << ", tick " << decoder.tick();
@@ -171,6 +182,7 @@ void ExpectSameState(Watched* w, RegionId r, const v1::StreamReplicasRequest& re
     if (request.velocities() || request.precision() == v1::EXACT) {
       ASSERT_LE(VelocityOff(told, pose), kSpeed[request.precision()]) << id;
     }
+    ASSERT_LE(Turned(told, pose), kDegrees[request.precision()]) << "body " << id << ", tick " << decoder.tick();
     ASSERT_EQ(told.asleep, pose.asleep) << id;
     ASSERT_TRUE(w->described().contains(id)) << id;
   }
@@ -248,6 +260,29 @@ v1::StreamReplicasRequest EveryTick() {
   v1::StreamReplicasRequest request;
   request.set_rate(1000);
   return request;
+}
+
+// Bodies of the real engine, which turn, fall asleep and wake up, in every precision and encoding.
+TEST(Replicas, TurningBodiesAreToldWithinTheBounds) {
+  for (int kind = 0; kind < 10; ++kind) {
+    SCOPED_TRACE(kind);
+    const absl::StatusOr<World> world = LoadWorldFile(AUREOLE_WORLDS "/demo.json");
+    ASSERT_TRUE(world.ok()) << world.status();
+    v1::StreamReplicasRequest request;
+    request.set_rate(31);
+    request.set_precision(kind < 4 ? v1::FINE : kind < 8 ? v1::COARSE : v1::EXACT);
+    request.set_velocities(kind % 2 == 1);
+    if (kind < 8 && kind % 4 >= 2) request.set_encoding(v1::BITS);
+    Watched w(*world, request, MakeBulletEngine);
+    std::vector<LostBody> lost;
+    for (Tick n = 2; n <= 300; n += 2) {
+      w.Step(n);
+      for (RegionId r = 0; r < w.regions(); ++r) {
+        ASSERT_NO_FATAL_FAILURE(w.Take(r, &lost));
+        ASSERT_NO_FATAL_FAILURE(ExpectSameState(&w, r, request));
+      }
+    }
+  }
 }
 
 TEST(Replicas, BodiesAtRestCostNothing) {

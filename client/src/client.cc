@@ -1,0 +1,348 @@
+#include "aureole/client.h"
+
+#include <algorithm>
+#include <chrono>
+#include <cmath>
+#include <condition_variable>
+#include <limits>
+#include <mutex>
+#include <random>
+#include <unordered_map>
+
+#include <grpcpp/create_channel.h>
+
+#include "aureole/v1/simulation.grpc.pb.h"
+#include "client/src/convert.h"
+#include "client/src/push_sender.h"
+#include "client/src/region_watch.h"
+#include "client/src/replica_merger.h"
+
+namespace aureole::client {
+namespace {
+
+using Clock = std::chrono::steady_clock;
+
+constexpr double kLongestExtrapolation = 0.25;  // s
+// A step of the servers' time against ours that is followed at once; smaller ones are smoothed.
+constexpr double kJump = 0.25;  // s
+constexpr double kSmoothing = 0.05;
+
+uint64_t RandomClient() {
+  std::random_device device;
+  return (uint64_t{device()} << 32 | device()) | 1;
+}
+
+double Seconds(Clock::time_point t) { return std::chrono::duration<double>(t.time_since_epoch()).count(); }
+
+std::chrono::system_clock::time_point Deadline(double seconds) {
+  return std::chrono::system_clock::now() +
+         std::chrono::duration_cast<std::chrono::system_clock::duration>(std::chrono::duration<double>(seconds));
+}
+
+Vec3 ToVec3(const std::array<double, 3>& v) { return {v[0], v[1], v[2]}; }
+
+Body BodyFrom(uint64_t id, const MergedBody& b) {
+  const auto& q = b.state.orientation;
+  return {id,
+          ToVec3(b.state.position),
+          {q[0], q[1], q[2], q[3]},
+          ToVec3(b.state.velocity),
+          ToVec3(b.state.angular_velocity),
+          b.region,
+          b.state.asleep};
+}
+
+Vec3 Between(const std::array<double, 3>& a, const std::array<double, 3>& b, double t) {
+  return {a[0] + (b[0] - a[0]) * t, a[1] + (b[1] - a[1]) * t, a[2] + (b[2] - a[2]) * t};
+}
+
+Quaternion Normalised(Quaternion q) {
+  const double n = std::sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w);
+  return n > 0 ? Quaternion{q.x / n, q.y / n, q.z / n, q.w / n} : Quaternion{};
+}
+
+// Along the shorter way; close enough to the arc for the small turns between frames.
+Quaternion Between(const std::array<double, 4>& a, const std::array<double, 4>& b, double t) {
+  const double dot = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3];
+  const double s = dot < 0 ? -t : t;
+  return Normalised(
+      {a[0] * (1 - t) + b[0] * s, a[1] * (1 - t) + b[1] * s, a[2] * (1 - t) + b[2] * s, a[3] * (1 - t) + b[3] * s});
+}
+
+// Turned by the angular velocity for a time.
+Quaternion Turned(const std::array<double, 4>& q, const std::array<double, 3>& w, double dt) {
+  const double speed = std::sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2]);
+  if (speed == 0) return {q[0], q[1], q[2], q[3]};
+  const double half = speed * dt / 2, s = std::sin(half) / speed, c = std::cos(half);
+  const double x = w[0] * s, y = w[1] * s, z = w[2] * s;
+  return Normalised({c * q[0] + x * q[3] + y * q[2] - z * q[1], c * q[1] - x * q[2] + y * q[3] + z * q[0],
+                     c * q[2] + x * q[1] - y * q[0] + z * q[3], c * q[3] - x * q[0] - y * q[1] - z * q[2]});
+}
+
+// A body at simulated time `tick`, which may be a fraction.
+Body At(uint64_t id, const MergedBody& b, double tick, double tick_seconds) {
+  Body out = BodyFrom(id, b);
+  const auto now = static_cast<double>(b.tick);
+  if (tick >= now) {
+    if (b.state.asleep) return out;
+    const double dt = std::min((tick - now) * tick_seconds, kLongestExtrapolation);
+    out.position.x += out.velocity.x * dt;
+    out.position.y += out.velocity.y * dt;
+    out.position.z += out.velocity.z * dt;
+    out.orientation = Turned(b.state.orientation, b.state.angular_velocity, dt);
+    return out;
+  }
+  const ToldBody* later = &b.state;
+  double later_tick = now;
+  for (const MergedBody::Before& before : b.before) {
+    if (before.tick == 0) break;
+    const auto earlier_tick = static_cast<double>(before.tick);
+    const double t = std::clamp((tick - earlier_tick) / std::max(later_tick - earlier_tick, 1e-9), 0.0, 1.0);
+    out.position = Between(before.state.position, later->position, t);
+    out.orientation = Between(before.state.orientation, later->orientation, t);
+    if (tick >= earlier_tick) break;
+    later = &before.state;
+    later_tick = earlier_tick;
+  }
+  return out;
+}
+
+}  // namespace
+
+struct Client::Impl {
+  Impl(World w, std::vector<std::string> endpoints)
+      : world(std::move(w)), pushes(std::move(endpoints), RandomClient()), calls_client(RandomClient()) {}
+
+  void OnFrame(int32_t region, const v1::ReplicaFrame& frame, const ReplicaDecoder& decoder, bool fresh);
+  void Follow(int64_t tick);
+  int64_t OldestTick() const;
+  template <class Request, class Response>
+  Status Call(grpc::Status (v1::Simulation::Stub::*method)(grpc::ClientContext*, const Request&, Response*),
+              const Request& request, Response* response, double timeout_seconds);
+
+  const World world;
+  PushSender pushes;
+
+  // Spawns and removals, one at a time.
+  const uint64_t calls_client;
+  std::mutex calls_mutex;
+  uint64_t calls_sequence = 0;
+
+  mutable std::mutex mutex;
+  mutable std::condition_variable changed;
+  ReplicaMerger merger;
+  std::unordered_map<uint64_t, std::shared_ptr<const Look>> looks;
+  struct Stream {
+    int64_t tick = 0;
+    bool complete = false;
+    double real_time_factor = 1;
+  };
+  std::vector<Stream> streams;
+  Counts counts;
+  // Simulated time of the servers less ours, s.
+  double offset = std::numeric_limits<double>::quiet_NaN();
+  int64_t newest = 0;
+
+  std::vector<std::unique_ptr<RegionWatch>> watches;  // last: ends first
+};
+
+void Client::Impl::OnFrame(int32_t region, const v1::ReplicaFrame& frame, const ReplicaDecoder& decoder, bool fresh) {
+  const std::lock_guard lock(mutex);
+  for (const v1::BodyDescription& d : frame.described()) {
+    const auto look = std::make_shared<const Look>(LookFrom(d));
+    uint64_t id = 0;
+    for (uint64_t step : d.body()) looks[id += step] = look;
+  }
+  merger.Apply(region, decoder);
+  std::vector<LostBody> lost = merger.lost();
+  Stream& stream = streams[static_cast<size_t>(region)];
+  stream.tick = decoder.tick();
+  stream.real_time_factor = frame.real_time_factor();
+  if (fresh) {
+    merger.Reconcile(region, decoder);
+    lost.insert(lost.end(), merger.lost().begin(), merger.lost().end());
+    stream.complete = true;
+    changed.notify_all();
+  }
+  for (const LostBody& l : lost) looks.erase(l.body);
+  ++counts.frames;
+  counts.bytes += static_cast<int64_t>(frame.ByteSizeLong());
+  Follow(decoder.tick());
+}
+
+void Client::Impl::Follow(int64_t tick) {
+  if (tick <= newest) return;
+  newest = tick;
+  const double now = static_cast<double>(tick) * world.tick_seconds - Seconds(Clock::now());
+  if (std::isnan(offset) || std::abs(now - offset) > kJump) {
+    offset = now;
+  } else {
+    offset += kSmoothing * (now - offset);
+  }
+}
+
+int64_t Client::Impl::OldestTick() const {
+  int64_t oldest = std::numeric_limits<int64_t>::max();
+  for (const Stream& s : streams) oldest = std::min(oldest, s.tick);
+  return streams.empty() ? 0 : oldest;
+}
+
+// At one server after the other until it is answered: a repetition acts once.
+template <class Request, class Response>
+Status Client::Impl::Call(grpc::Status (v1::Simulation::Stub::*method)(grpc::ClientContext*, const Request&, Response*),
+                          const Request& request, Response* response, double timeout_seconds) {
+  const auto deadline = Deadline(timeout_seconds);
+  for (size_t server = 0;; ++server) {
+    const std::string& endpoint = world.regions[server % world.regions.size()].endpoint;
+    const auto stub = v1::Simulation::NewStub(grpc::CreateChannel(endpoint, grpc::InsecureChannelCredentials()));
+    grpc::ClientContext context;
+    context.set_deadline(deadline);
+    response->Clear();
+    const grpc::Status s = (stub.get()->*method)(&context, request, response);
+    const bool retry = s.error_code() == grpc::StatusCode::UNAVAILABLE || s.error_code() == grpc::StatusCode::CANCELLED;
+    if (!retry || std::chrono::system_clock::now() + std::chrono::milliseconds(100) >= deadline) return FromGrpc(s);
+    std::this_thread::sleep_for(std::chrono::milliseconds(50));
+  }
+}
+
+Status Client::Connect(const std::string& server, std::unique_ptr<Client>* client, double timeout_seconds) {
+  const auto stub = v1::Simulation::NewStub(grpc::CreateChannel(server, grpc::InsecureChannelCredentials()));
+  grpc::ClientContext context;
+  context.set_deadline(Deadline(timeout_seconds));
+  context.set_wait_for_ready(true);
+  v1::GetWorldResponse response;
+  if (const grpc::Status s = stub->GetWorld(&context, {}, &response); !s.ok()) return FromGrpc(s);
+  World world = WorldFrom(response);
+  std::vector<std::string> endpoints{server};
+  for (const World::Region& r : world.regions) {
+    if (r.endpoint != server) endpoints.push_back(r.endpoint);
+  }
+  client->reset(new Client(std::make_unique<Impl>(std::move(world), std::move(endpoints))));
+  return {};
+}
+
+Client::Client(std::unique_ptr<Impl> impl) : impl_(std::move(impl)) {}
+Client::~Client() = default;
+
+const World& Client::world() const { return impl_->world; }
+
+Status Client::Watch(const WatchOptions& options) {
+  if (!(options.rate > 0 && options.rate <= 1000)) {
+    return {3, "rate: must be above 0 and at most 1000 per second", "BAD_VALUE", "rate"};
+  }
+  if (options.sphere.has_value() && !(options.sphere->radius > 0)) {
+    return {3, "sphere.radius: must be above 0 m", "BAD_VALUE", "sphere.radius"};
+  }
+  if (options.rect.has_value() &&
+      !(options.rect->min_x <= options.rect->max_x && options.rect->min_z <= options.rect->max_z)) {
+    return {3, "rect: must not end before it begins", "BAD_VALUE", "rect"};
+  }
+  const v1::StreamReplicasRequest request = RequestOf(options);
+  if (!impl_->watches.empty()) {
+    for (auto& watch : impl_->watches) watch->Want(request);
+    return {};
+  }
+  impl_->streams.resize(impl_->world.regions.size());
+  for (size_t r = 0; r < impl_->world.regions.size(); ++r) {
+    RegionWatch::Events events;
+    events.frame = [impl = impl_.get(), r](const v1::ReplicaFrame& frame, const ReplicaDecoder& decoder, bool fresh) {
+      impl->OnFrame(static_cast<int32_t>(r), frame, decoder, fresh);
+    };
+    events.connection = [impl = impl_.get()](bool up) {
+      const std::lock_guard lock(impl->mutex);
+      ++(up ? impl->counts.connections : impl->counts.lost_connections);
+    };
+    impl_->watches.push_back(
+        std::make_unique<RegionWatch>(impl_->world.regions[r].endpoint, request, std::move(events)));
+  }
+  return {};
+}
+
+bool Client::WaitUntilComplete(double timeout_seconds) const {
+  std::unique_lock lock(impl_->mutex);
+  return impl_->changed.wait_for(lock, std::chrono::duration<double>(timeout_seconds), [this] {
+    return !impl_->streams.empty() &&
+           std::all_of(impl_->streams.begin(), impl_->streams.end(), [](const Impl::Stream& s) { return s.complete; });
+  });
+}
+
+void Client::Latest(std::vector<Body>* bodies, int64_t* tick) const {
+  bodies->clear();
+  {
+    const std::lock_guard lock(impl_->mutex);
+    for (const auto& [id, body] : impl_->merger.bodies()) bodies->push_back(BodyFrom(id, body));
+    if (tick != nullptr) *tick = impl_->OldestTick();
+  }
+  std::sort(bodies->begin(), bodies->end(), [](const Body& x, const Body& y) { return x.id < y.id; });
+}
+
+void Client::Sample(std::vector<Body>* bodies, double delay_seconds) const {
+  bodies->clear();
+  {
+    const std::lock_guard lock(impl_->mutex);
+    const double seconds = Seconds(Clock::now()) + impl_->offset - delay_seconds;
+    const double tick = seconds / impl_->world.tick_seconds;
+    for (const auto& [id, body] : impl_->merger.bodies()) {
+      bodies->push_back(At(id, body, tick, impl_->world.tick_seconds));
+    }
+  }
+  std::sort(bodies->begin(), bodies->end(), [](const Body& x, const Body& y) { return x.id < y.id; });
+}
+
+std::optional<Look> Client::LookOf(uint64_t body) const {
+  const std::lock_guard lock(impl_->mutex);
+  const auto it = impl_->looks.find(body);
+  return it == impl_->looks.end() ? std::nullopt : std::optional<Look>(*it->second);
+}
+
+double Client::real_time_factor() const {
+  const std::lock_guard lock(impl_->mutex);
+  double least = 1;
+  for (const Impl::Stream& s : impl_->streams) least = std::min(least, s.real_time_factor);
+  return least;
+}
+
+Counts Client::counts() const {
+  const std::lock_guard lock(impl_->mutex);
+  return impl_->counts;
+}
+
+void Client::Do(const Push& push) { impl_->pushes.Send(push); }
+
+Status Client::Flush(double timeout_seconds, PushCounts* counts) {
+  const bool all = impl_->pushes.Flush(timeout_seconds);
+  if (counts != nullptr) *counts = impl_->pushes.counts();
+  return all ? Status{} : Status{4, "not all pushes have been settled in time", "", ""};
+}
+
+PushCounts Client::pushes() const { return impl_->pushes.counts(); }
+
+Status Client::Spawn(const std::vector<NewBody>& bodies, std::vector<uint64_t>* ids, double timeout_seconds) {
+  const std::lock_guard lock(impl_->calls_mutex);
+  v1::SpawnBodiesRequest request;
+  v1::SpawnBodiesResponse response;
+  request.set_client(impl_->calls_client);
+  request.set_sequence(impl_->calls_sequence + 1);
+  impl_->calls_sequence += bodies.size();
+  for (const NewBody& b : bodies) *request.add_bodies() = BodyOf(b);
+  const Status s = impl_->Call<v1::SpawnBodiesRequest, v1::SpawnBodiesResponse>(&v1::Simulation::Stub::SpawnBodies,
+                                                                                request, &response, timeout_seconds);
+  if (ids != nullptr) ids->assign(response.body().begin(), response.body().end());
+  return s;
+}
+
+Status Client::Remove(const std::vector<uint64_t>& bodies, int64_t* removed, double timeout_seconds) {
+  const std::lock_guard lock(impl_->calls_mutex);
+  v1::RemoveBodiesRequest request;
+  v1::RemoveBodiesResponse response;
+  request.set_client(impl_->calls_client);
+  request.set_sequence(impl_->calls_sequence + 1);
+  impl_->calls_sequence += bodies.size();
+  request.mutable_body()->Add(bodies.begin(), bodies.end());
+  const Status s = impl_->Call<v1::RemoveBodiesRequest, v1::RemoveBodiesResponse>(&v1::Simulation::Stub::RemoveBodies,
+                                                                                  request, &response, timeout_seconds);
+  if (removed != nullptr) *removed = response.removed();
+  return s;
+}
+
+}  // namespace aureole::client

@@ -1,0 +1,51 @@
+// The stream of one region: opened, read, acknowledged, and opened again when it was lost.
+#pragma once
+
+#include <condition_variable>
+#include <functional>
+#include <memory>
+#include <mutex>
+#include <string>
+#include <thread>
+
+#include <grpcpp/client_context.h>
+
+#include "aureole/v1/simulation.grpc.pb.h"
+#include "client/src/replica_decoder.h"
+
+namespace aureole::client {
+
+class RegionWatch {
+ public:
+  struct Events {
+    // After the decoder has taken a frame; `fresh`: the first complete state of a new stream.
+    std::function<void(const v1::ReplicaFrame&, const ReplicaDecoder&, bool fresh)> frame;
+    std::function<void(bool up)> connection;
+  };
+  // Both are called on the watch's own thread.
+  RegionWatch(std::string endpoint, v1::StreamReplicasRequest request, Events events);
+  ~RegionWatch();
+
+  // Changes the view, the rate or the level of detail.
+  void Want(const v1::StreamReplicasRequest& request);
+  // Cuts the connection, as a network may. For tests.
+  void Cut();
+
+ private:
+  using Stream = grpc::ClientReaderWriter<v1::PlayRequest, v1::PlayResponse>;
+
+  void Run();
+  void Read(Stream* stream);
+
+  const std::string endpoint_;
+  const Events events_;
+  std::mutex mutex_;
+  std::condition_variable ended_changed_;
+  v1::StreamReplicasRequest request_;
+  std::shared_ptr<grpc::ClientContext> context_;
+  Stream* stream_ = nullptr;  // may be written to
+  bool ended_ = false;
+  std::thread thread_;
+};
+
+}  // namespace aureole::client
