@@ -3,6 +3,7 @@
 #include <iostream>
 
 #include <absl/strings/numbers.h>
+#include <absl/strings/str_format.h>
 #include <absl/strings/str_split.h>
 #include <nlohmann/json.hpp>
 
@@ -149,6 +150,44 @@ int RunSpawn(const SpawnOptions& o) {
     for (uint64_t id : ids) std::cout << id << std::endl;
   }
   return kExitOk;
+}
+
+CLI::App* AddRay(CLI::App& app, RayOptions* o) {
+  CLI::App* c = app.add_subcommand("ray", "What a ray hits first in a running world");
+  AddServer(c, &o->server);
+  AddVector(c, "--from", &o->from, "m")->required();
+  AddVector(c, "--direction", &o->direction, "Of any length but 0")->required();
+  c->add_option("--length", o->length, "m")->capture_default_str();
+  c->add_flag("--json", o->json, "One JSON object instead of text");
+  c->footer(
+      std::string("Example:\n"
+                  "  aureole ray --server 127.0.0.1:40001 --from 0,50,0 --direction 0,-1,0\n\n"
+                  "Exit codes: 0 it hit something; 1 it hit nothing; 2 bad input."));
+  return c;
+}
+
+int RunRay(const RayOptions& o) {
+  const std::unique_ptr<client::Client> client = ConnectTo(o.server);
+  if (client == nullptr) return kExitBadInput;
+  client::RayHit hit;
+  const client::Status s = client->CastRay(VectorOf(o.from), VectorOf(o.direction), o.length, &hit, kTimeout);
+  if (!s.ok()) return Report(s);
+  const client::Vec3 &p = hit.point, &n = hit.normal;
+  if (o.json) {
+    Json out = {{"body", hit.body}};
+    if (hit.body != 0) {
+      out.update(
+          {{"fixed", hit.fixed}, {"distance", hit.distance}, {"point", {p.x, p.y, p.z}}, {"normal", {n.x, n.y, n.z}}});
+    }
+    std::cout << out.dump() << std::endl;
+  } else if (hit.body == 0) {
+    std::cout << "nothing" << std::endl;
+  } else {
+    std::cout << absl::StrFormat("body %d%s, %.3f m away, at %.3f, %.3f, %.3f\n", hit.body, hit.fixed ? " (fixed)" : "",
+                                 hit.distance, p.x, p.y, p.z)
+              << std::flush;
+  }
+  return hit.body != 0 ? kExitOk : kExitFailed;
 }
 
 CLI::App* AddRemove(CLI::App& app, RemoveOptions* o) {

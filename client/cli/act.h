@@ -1,4 +1,4 @@
-// `aureole push`, `aureole spawn`, `aureole remove`: what a client does to a running world.
+// `aureole push`, `aureole spawn`, `aureole remove`, `aureole ray`: what a client does to a running world.
 #pragma once
 
 #include <cstdint>
@@ -31,6 +31,15 @@ struct SpawnOptions {
 };
 CLI::App* AddSpawn(CLI::App& app, SpawnOptions* options);
 int RunSpawn(const SpawnOptions& options);
+
+struct RayOptions {
+  std::string server;
+  std::vector<double> from, direction;
+  double length = 1000;
+  bool json = false;
+};
+CLI::App* AddRay(CLI::App& app, RayOptions* options);
+int RunRay(const RayOptions& options);
 
 struct RemoveOptions {
   std::string server;

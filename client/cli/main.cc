@@ -32,12 +32,14 @@ int main(int argc, char** argv) {
   aureole::PushOptions push_options;
   aureole::SpawnOptions spawn_options;
   aureole::RemoveOptions remove_options;
+  aureole::RayOptions ray_options;
   aureole::WatchCliOptions watch_options;
   const CLI::App* up = aureole::AddUp(app, &up_options);
   const CLI::App* experiment = aureole::AddExperiment(app, &experiment_options);
   const CLI::App* watch = aureole::AddWatch(app, &watch_options);
   const CLI::App* push = aureole::AddPush(app, &push_options);
   const CLI::App* spawn = aureole::AddSpawn(app, &spawn_options);
+  const CLI::App* ray = aureole::AddRay(app, &ray_options);
   const CLI::App* remove = aureole::AddRemove(app, &remove_options);
   const CLI::App* load = aureole::AddLoad(app, &load_options);
   aureole::AddCheck(app, &check_options);
@@ -51,6 +53,7 @@ int main(int argc, char** argv) {
   if (watch->parsed()) return aureole::RunWatch(watch_options);
   if (push->parsed()) return aureole::RunPush(push_options);
   if (spawn->parsed()) return aureole::RunSpawn(spawn_options);
+  if (ray->parsed()) return aureole::RunRay(ray_options);
   if (remove->parsed()) return aureole::RunRemove(remove_options);
   if (load->parsed()) return aureole::RunLoad(load_options);
   return aureole::Check(check_options);

@@ -7,6 +7,7 @@
 #include <limits>
 #include <mutex>
 #include <random>
+#include <thread>
 #include <unordered_map>
 
 #include <grpcpp/create_channel.h>
@@ -329,6 +330,47 @@ Status Client::Spawn(const std::vector<NewBody>& bodies, std::vector<uint64_t>* 
                                                                                 request, &response, timeout_seconds);
   if (ids != nullptr) ids->assign(response.body().begin(), response.body().end());
   return s;
+}
+
+// Bodies may be on other servers than their place says, so all are asked, at once.
+Status Client::CastRay(const Vec3& origin, const Vec3& direction, double length, RayHit* hit, double timeout_seconds) {
+  v1::CastRaysRequest request;
+  v1::CastRaysRequest::Ray* ray = request.add_rays();
+  for (const auto& [from, to] :
+       {std::pair(origin, ray->mutable_origin()), std::pair(direction, ray->mutable_direction())}) {
+    to->set_x(from.x);
+    to->set_y(from.y);
+    to->set_z(from.z);
+  }
+  ray->set_length(length);
+  struct Answer {
+    v1::CastRaysResponse response;
+    grpc::Status status;
+  };
+  std::vector<Answer> answers(impl_->world.regions.size());
+  std::vector<std::thread> threads;
+  for (size_t i = 0; i < answers.size(); ++i) {
+    threads.emplace_back([&, i] {
+      const auto stub = v1::Simulation::NewStub(
+          grpc::CreateChannel(impl_->world.regions[i].endpoint, grpc::InsecureChannelCredentials()));
+      grpc::ClientContext context;
+      context.set_deadline(Deadline(timeout_seconds));
+      answers[i].status = stub->CastRays(&context, request, &answers[i].response);
+    });
+  }
+  for (std::thread& t : threads) t.join();
+  *hit = {};
+  for (const Answer& a : answers) {
+    if (!a.status.ok()) return FromGrpc(a.status);
+    const v1::CastRaysResponse::Hit& h = a.response.hits(0);
+    if (h.body() == 0 || (hit->body != 0 && h.distance() >= hit->distance)) continue;
+    *hit = {h.body(),
+            h.fixed(),
+            h.distance(),
+            {h.point().x(), h.point().y(), h.point().z()},
+            {h.normal().x(), h.normal().y(), h.normal().z()}};
+  }
+  return {};
 }
 
 Status Client::Remove(const std::vector<uint64_t>& bodies, int64_t* removed, double timeout_seconds) {

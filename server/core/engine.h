@@ -11,6 +11,7 @@
 
 #include <cstdint>
 #include <memory>
+#include <optional>
 #include <span>
 #include <string>
 #include <string_view>
@@ -69,6 +70,14 @@ struct BodyLook {
   Material material;
 };
 
+// Where a ray meets a body first.
+struct RayHit {
+  BodyId id = 0;
+  bool fixed = false;   // static or kinematic
+  double fraction = 0;  // of the way from the ray's begin to its end
+  Vec3 normal = Vec3::UnitY();
+};
+
 struct EngineCounts {
   int64_t bodies = 0;  // dynamic
   int64_t awake = 0;
@@ -110,6 +119,8 @@ class Engine {
   virtual void AppendAwake(std::vector<BodyPose>* out) const = 0;
   virtual void AppendPoses(const Box& box, std::vector<BodyPose>* out) const = 0;
   virtual int64_t CountAwake() const = 0;  // constant time
+  // The nearest body on the way, static and kinematic ones too; nothing when there is none.
+  virtual std::optional<RayHit> CastRay(const Vec3& from, const Vec3& to) const = 0;
   // From here on, bodies that fall asleep are noted; and those noted since the last call, appended in no order.
   virtual void NoteSleepers(bool on) = 0;
   virtual void TakeSleepers(std::vector<BodyId>* out) = 0;

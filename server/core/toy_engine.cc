@@ -175,6 +175,29 @@ class ToyEngine final : public Engine {
 
   int64_t CountAwake() const override { return Counts().awake; }
 
+  std::optional<RayHit> CastRay(const Vec3& from, const Vec3& to) const override {
+    std::optional<RayHit> nearest;
+    const Vec3 way = to - from;
+    for (const Body& b : bodies_) {
+      const Box box = BoxOf(b);
+      double enter = 0, leave = 1;
+      Vec3 normal = Vec3::UnitY();
+      for (int i = 0; i < 3; ++i) {
+        const double x = (box.min[i] - from[i]) / way[i], y = (box.max[i] - from[i]) / way[i];
+        if (way[i] == 0 && (from[i] < box.min[i] || from[i] > box.max[i])) leave = -1;
+        if (way[i] == 0) continue;
+        if (std::min(x, y) > enter) {
+          enter = std::min(x, y);
+          normal = way[i] > 0 ? Vec3(-Vec3::Unit(i)) : Vec3(Vec3::Unit(i));
+        }
+        leave = std::min(leave, std::max(x, y));
+      }
+      if (enter > leave || (nearest.has_value() && enter >= nearest->fraction)) continue;
+      nearest = RayHit{b.id, false, enter, normal};
+    }
+    return nearest;
+  }
+
   void NoteSleepers(bool on) override {
     note_fallen_ = on;
     fallen_.clear();

@@ -46,6 +46,17 @@ class Broadphase {
     moving_.collideTV(moving_.m_root, btDbvtVolume::FromMM(low, high), hits);
   }
 
+  // Calls fn(Body*) for every body, fixed ones too, whose fat box meets the line, in no particular order.
+  template <class Fn>
+  void ForEachOnRay(const btVector3& begin, const btVector3& end, Fn&& fn) const {
+    struct Hits : btDbvt::ICollide {
+      explicit Hits(Fn& f) : call(f) {}
+      void Process(const btDbvtNode* leaf) override { call(static_cast<Body*>(leaf->data)); }
+      Fn& call;
+    } hits(fn);
+    for (const btDbvt* tree : {const_cast<const btDbvt*>(&moving_), &fixed_}) btDbvt::rayTest(tree->m_root, begin, end, hits);
+  }
+
  private:
   void FindPairs(Body* body);
   void AddPair(Body* x, Body* y);

@@ -63,6 +63,7 @@ class BulletEngine : public Engine {
   void AppendAwake(std::vector<BodyPose>* out) const override;
   void AppendPoses(const Box& box, std::vector<BodyPose>* out) const override;
   int64_t CountAwake() const override { return static_cast<int64_t>(world_.awake().size()); }
+  std::optional<RayHit> CastRay(const Vec3& from, const Vec3& to) const override;
   void NoteSleepers(bool on) override { world_.NoteFallen(on); }
   void TakeSleepers(std::vector<BodyId>* out) override { world_.TakeFallen(out); }
   double MaxRadius() const override { return world_.max_radius(); }
@@ -164,6 +165,20 @@ void BulletEngine::AppendPoses(const Box& box, std::vector<BodyPose>* out) const
   const auto first = static_cast<std::ptrdiff_t>(out->size());
   world_.broadphase().Query(ToBullet(box.min), ToBullet(box.max), [out](const Body* b) { out->push_back(PoseOf(*b)); });
   std::sort(out->begin() + first, out->end(), ById);
+}
+
+std::optional<RayHit> BulletEngine::CastRay(const Vec3& from, const Vec3& to) const {
+  const btVector3 begin = ToBullet(from), end = ToBullet(to);
+  const btTransform first(btQuaternion::getIdentity(), begin), last(btQuaternion::getIdentity(), end);
+  btCollisionWorld::ClosestRayResultCallback nearest(begin, end);
+  world_.broadphase().ForEachOnRay(begin, end, [&](Body* b) {
+    btCollisionWorld::rayTestSingle(first, last, &b->rigid, b->rigid.getCollisionShape(), b->rigid.getWorldTransform(),
+                                    nearest);
+  });
+  if (!nearest.hasHit()) return std::nullopt;
+  const auto* body = static_cast<const Body*>(nearest.m_collisionObject->getUserPointer());
+  return RayHit{body->id, !body->dynamic(), nearest.m_closestHitFraction,
+                FromBullet(nearest.m_hitNormalWorld).normalized()};
 }
 
 uint64_t BulletEngine::Hash(BodyId id) const {

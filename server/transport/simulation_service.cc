@@ -75,8 +75,14 @@ grpc::ServerUnaryReactor* SimulationService::RemoveBodies(grpc::CallbackServerCo
   return inputs_.RemoveBodies(*request, response);
 }
 
+grpc::ServerUnaryReactor* SimulationService::CastRays(grpc::CallbackServerContext*, const v1::CastRaysRequest* request,
+                                                      v1::CastRaysResponse* response) {
+  return rays_.Cast(*request, response);
+}
+
 void SimulationService::Serve(const v1::Assignment& assignment, const World& world) {
   inputs_.Serve(assignment.world(), world.environment.tick_us);
+  rays_.Serve();
   replicas_.Serve(assignment.region(), assignment.layout_epoch(), world.environment.tick_us);
   const std::lock_guard lock(mutex_);
   serving_ = true;
@@ -98,6 +104,7 @@ void SimulationService::Serve(const v1::Assignment& assignment, const World& wor
 
 void SimulationService::Stop() {
   inputs_.Stop();
+  rays_.Stop();
   replicas_.Stop(RegionGivenUp());
   const std::lock_guard lock(mutex_);
   serving_ = false;
@@ -106,6 +113,7 @@ void SimulationService::Stop() {
 void SimulationService::AfterTick(Region* region, int64_t bodies) {
   tick_ = region->tick();
   bodies_ = bodies;
+  rays_.Answer(*region);
   replicas_.AfterTick(region);
 }
 

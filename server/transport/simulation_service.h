@@ -13,15 +13,17 @@
 #include "server/core/region.h"
 #include "server/core/world.h"
 #include "server/transport/input_service.h"
+#include "server/transport/ray_service.h"
 #include "server/transport/replica_publisher.h"
 
 namespace aureole {
 
 // As generated, but for replicas, which are written as bytes that many calls share.
-using SimulationCalls = v1::Simulation::WithCallbackMethod_GetWorld<
-    v1::Simulation::WithRawCallbackMethod_StreamReplicas<v1::Simulation::WithRawCallbackMethod_Play<
-        v1::Simulation::WithCallbackMethod_ApplyImpulses<v1::Simulation::WithCallbackMethod_SpawnBodies<
-            v1::Simulation::WithCallbackMethod_RemoveBodies<v1::Simulation::Service>>>>>>;
+using SimulationCalls =
+    v1::Simulation::WithCallbackMethod_GetWorld<v1::Simulation::WithRawCallbackMethod_StreamReplicas<
+        v1::Simulation::WithRawCallbackMethod_Play<v1::Simulation::WithCallbackMethod_ApplyImpulses<
+            v1::Simulation::WithCallbackMethod_SpawnBodies<v1::Simulation::WithCallbackMethod_RemoveBodies<
+                v1::Simulation::WithCallbackMethod_CastRays<v1::Simulation::Service>>>>>>>;
 
 class SimulationService final : public SimulationCalls {
  public:
@@ -34,6 +36,8 @@ class SimulationService final : public SimulationCalls {
                                                            v1::ImpulseSummary* response) override;
   grpc::ServerUnaryReactor* SpawnBodies(grpc::CallbackServerContext* context, const v1::SpawnBodiesRequest* request,
                                         v1::SpawnBodiesResponse* response) override;
+  grpc::ServerUnaryReactor* CastRays(grpc::CallbackServerContext* context, const v1::CastRaysRequest* request,
+                                     v1::CastRaysResponse* response) override;
   grpc::ServerUnaryReactor* RemoveBodies(grpc::CallbackServerContext* context, const v1::RemoveBodiesRequest* request,
                                          v1::RemoveBodiesResponse* response) override;
 
@@ -49,6 +53,7 @@ class SimulationService final : public SimulationCalls {
 
  private:
   InputService inputs_;
+  RayService rays_;
   ReplicaPublisher replicas_;
   std::atomic<Tick> tick_ = 0;
   std::atomic<int64_t> bodies_ = 0;

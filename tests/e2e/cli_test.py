@@ -224,7 +224,8 @@ class Input(Cli):
         self.assertTrue(err.startswith(str(broken)))
 
     def test_help_has_examples_and_exit_codes(self):
-        for command in ([], ["up"], ["experiment"], ["check"], ["watch"], ["push"], ["spawn"], ["remove"], ["load"]):
+        for command in ([], ["up"], ["experiment"], ["check"], ["watch"], ["push"], ["spawn"], ["remove"], ["load"],
+                        ["ray"]):
             code, out, _ = self.run_cli(*command, "--help")
             self.assertEqual(code, 0)
             self.assertIn("Example", out)
@@ -270,6 +271,14 @@ class Clients(Cli):
         self.assertEqual(json.loads(out), {"applied": 1, "bodies": 1, "rejected": {}})
         self.assertGreater(self.bodies("--rect", "-9,9,-9,9")[spawned]["velocity"][1], 20)
         self.assertNotIn(spawned, self.bodies("--sphere", "300,300,10"))
+        self.ask("spawn", "--shape", "box:4,1,4", "--position", "200,80,0", server=3)
+        out, _ = self.ask("ray", "--from", "200,500,0", "--direction", "0,-1,0", "--json")
+        hit = json.loads(out)
+        self.assertFalse(hit["fixed"])
+        self.assertGreater(hit["distance"], 419)
+        self.assertEqual([round(x, 6) for x in hit["normal"]], [0, 1, 0])
+        self.assertIn("(fixed)", self.ask("ray", "--from", "210,50,0", "--direction", "0,-1,0", server=2)[0])
+        self.assertEqual(self.ask("ray", "--from", "0,500,0", "--direction", "0,1,0", code=1)[0], "nothing\n")
         self.assertEqual(self.ask("remove", spawned, server=2)[0], "1 of 1 removed\n")
         self.assertEqual(self.ask("remove", spawned, code=1)[0], "0 of 1 removed\n")
         self.assertIn("NO_SUCH_BODY", self.ask("push", "--body", spawned, "--velocity", "0,1,0", code=1)[0])
@@ -288,6 +297,7 @@ class Clients(Cli):
                                 (["push", "--body", "3", "--impulse", "1,2"], "--impulse"),
                                 (["push", "--body", "3", "--force", "0,1,0"], ""),
                                 (["push", "--sphere", "0,0,0,5"], "--impulse"),
+                                (["ray", "--from", "0,0,0", "--direction", "0,0,0"], "rays[0].direction"),
                                 (["watch", "--rect", "5,-5,0,1"], "rect")):
             _, err = self.ask(arguments[0], *arguments[1:], code=2)
             self.assertIn(word, err)

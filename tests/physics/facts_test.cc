@@ -83,6 +83,29 @@ TEST(Physics, ImpulseAtAPointTurnsABodyAsItsMomentDoes) {
   }
 }
 
+TEST(Physics, RayHitsTheNearestBodyWhereItsSurfaceIs) {
+  const auto engine = MakeBulletEngine(Ground());
+  BodySpec turned = Dynamic(11, BoxShape(0.5, 0.5, 0.5), Vec3(0, 5, 0));
+  turned.orientation = Quat(Eigen::AngleAxisd(3.14159265358979323846 / 4, Vec3::UnitY()));
+  engine->Spawn(turned);
+  engine->Spawn(Dynamic(12, SphereShape(1), Vec3(10, 5, 0)));
+  std::optional<RayHit> hit = engine->CastRay(Vec3(-10, 5, 0), Vec3(20, 5, 0));
+  ASSERT_TRUE(hit.has_value());
+  EXPECT_EQ(hit->id, 11u);
+  EXPECT_FALSE(hit->fixed);
+  EXPECT_NEAR(hit->fraction, (10 - std::sqrt(0.5)) / 30, 0.05 / 30);
+  hit = engine->CastRay(Vec3(10, 50, 0), Vec3(10, -50, 0));
+  ASSERT_TRUE(hit.has_value());
+  EXPECT_EQ(hit->id, 12u);
+  EXPECT_NEAR(hit->fraction, 0.44, 1e-3);
+  EXPECT_NEAR(hit->normal.y(), 1, 1e-3);
+  hit = engine->CastRay(Vec3(30, 50, 0), Vec3(30, -50, 0));
+  ASSERT_TRUE(hit.has_value());
+  EXPECT_TRUE(hit->fixed) << "the ground";
+  EXPECT_NEAR(hit->fraction, 0.5, 1e-6);
+  EXPECT_FALSE(engine->CastRay(Vec3(30, 50, 0), Vec3(30, 90, 0)).has_value());
+}
+
 TEST(Physics, ChangeOfVelocityAddsWhateverTheMass) {
   const auto engine = MakeBulletEngine(Ground());
   BodySpec b = Dynamic(7, SphereShape(0.5), Vec3(0, 9, 0));

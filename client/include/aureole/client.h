@@ -135,6 +135,14 @@ struct PushCounts {
   std::vector<std::pair<std::string, int64_t>> reasons;  // of the rejected ones
 };
 
+// What a ray hits first.
+struct RayHit {
+  uint64_t body = 0;    // 0: nothing
+  bool fixed = false;   // it is static or follows a script
+  double distance = 0;  // m
+  Vec3 point, normal;   // m; out of the body
+};
+
 struct Counts {
   int64_t frames = 0, bytes = 0;
   int64_t connections = 0, lost_connections = 0;
@@ -173,6 +181,8 @@ class Client {
   PushCounts pushes() const;
   // `ids`: one per body, 0 for one that was not added.
   Status Spawn(const std::vector<NewBody>& bodies, std::vector<uint64_t>* ids, double timeout_seconds = 10);
+  // In the servers' newest states. UNAVAILABLE (14) when one of them does not answer.
+  Status CastRay(const Vec3& origin, const Vec3& direction, double length, RayHit* hit, double timeout_seconds = 2);
   Status Remove(const std::vector<uint64_t>& bodies, int64_t* removed = nullptr, double timeout_seconds = 10);
 
  private:
