@@ -54,7 +54,8 @@ class Broadphase {
       void Process(const btDbvtNode* leaf) override { call(static_cast<Body*>(leaf->data)); }
       Fn& call;
     } hits(fn);
-    for (const btDbvt* tree : {const_cast<const btDbvt*>(&moving_), &fixed_}) btDbvt::rayTest(tree->m_root, begin, end, hits);
+    for (const btDbvt* tree : {const_cast<const btDbvt*>(&moving_), &fixed_})
+      btDbvt::rayTest(tree->m_root, begin, end, hits);
   }
 
  private:
