@@ -137,9 +137,10 @@ v1::Impulse ImpulseOf(const Push& push, uint64_t sequence) {
     case Push::Kind::kForce: {
       if (linear) Set(push.linear, out.mutable_force());
       if (!IsZero(push.angular)) Set(push.angular, out.mutable_torque());
-      const double whole = std::floor(push.seconds);
-      out.mutable_duration()->set_seconds(static_cast<int64_t>(whole));
-      out.mutable_duration()->set_nanos(static_cast<int32_t>((push.seconds - whole) * 1e9));
+      // The servers count in microseconds. What is no time at all is theirs to refuse.
+      const int64_t us = std::isfinite(push.seconds) ? std::llround(std::clamp(push.seconds, -1e9, 1e9) * 1e6) : 0;
+      out.mutable_duration()->set_seconds(us / 1'000'000);
+      out.mutable_duration()->set_nanos(static_cast<int32_t>(us % 1'000'000 * 1000));
       break;
     }
   }

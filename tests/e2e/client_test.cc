@@ -186,6 +186,14 @@ TEST(Client, SpawnsPushesAndRemovesABodyThatItSees) {
     ASSERT_TRUE(client->Flush(10, &counts).ok());
     EXPECT_EQ(counts.bodies, 1);
     EXPECT_TRUE(wait_for([&] { return Find(bodies, ids[0]) != nullptr && Find(bodies, ids[0])->position.y > 21; }));
+    push.kind = Push::Kind::kForce;
+    for (double seconds : {1.0 / 60, 1.4}) {  // no whole numbers of nanoseconds
+      push.seconds = seconds;
+      client->Do(push);
+    }
+    ASSERT_TRUE(client->Flush(10, &counts).ok());
+    EXPECT_EQ(counts.applied, 3);
+    EXPECT_EQ(counts.rejected, 0);
     int64_t removed = 0;
     EXPECT_TRUE(client->Remove({ids[0], 4711}, &removed).ok());
     EXPECT_EQ(removed, 1);
@@ -197,7 +205,7 @@ TEST(Client, SpawnsPushesAndRemovesABodyThatItSees) {
     EXPECT_EQ(s.code, 3);
     EXPECT_EQ(s.reason, "BAD_VALUE");
     EXPECT_EQ(s.field, "bodies[0].mass");
-    push.kind = Push::Kind::kForce;  // without a duration
+    push.seconds = 0;  // a force needs a duration
     client->Do(push);
     ASSERT_TRUE(client->Flush(10, &counts).ok());
     EXPECT_EQ(counts.rejected, 1);
