@@ -198,8 +198,11 @@ void RunSeed(uint64_t seed, int64_t* transfers) {
   request.set_velocities(seed % 2 == 0);
   if (request.precision() != v1::EXACT && seed / 3 % 2 == 0) request.set_encoding(v1::BITS);
   const double slow = seed % 4 == 3 ? 0 : 0.3;  // share of ticks in which a reader is busy
+  const double late = seed % 5 < 2 ? 0.3 : 0;   // share of ticks in which a stream's frames are read later
   Watched w(scenario.world, request);
   std::vector<LostBody> lost;
+  std::set<uint64_t> gone;  // for ever: ids are not used again
+  std::map<uint64_t, uint32_t> epochs;
   for (Tick n = 1; n <= scenario.ticks; ++n) {
     for (RegionId r = 0; r < w.regions(); ++r) w.reader(r).SetBusy(rng.Chance(slow));
     w.Step(n);
@@ -208,16 +211,23 @@ void RunSeed(uint64_t seed, int64_t* transfers) {
     for (size_t i = order.size(); i > 1; --i)
       std::swap(order[i - 1], order[static_cast<size_t>(rng.Below(static_cast<int>(i)))]);
     for (RegionId r : order) {
+      if (rng.Chance(late)) continue;
       lost.clear();
       ASSERT_NO_FATAL_FAILURE(w.Take(r, &lost));
       if (w.decoder(r).tick() == 0) continue;
       ASSERT_NO_FATAL_FAILURE(ExpectSameState(&w, r, request));
       for (const LostBody& l : lost) {
+        gone.insert(l.body);
         ASSERT_EQ(w.split().Owner(l.body), kNoRegion)
             << "body " << l.body << " flickers at tick " << n << " after a frame of region " << r;
       }
     }
-    if (slow > 0) continue;
+    for (const auto& [id, body] : w.merger().bodies()) {
+      ASSERT_FALSE(gone.contains(id)) << "body " << id << " was lost and is back at tick " << n;
+      ASSERT_GE(body.state.epoch, epochs[id]) << "body " << id << " is back at a former server at tick " << n;
+      epochs[id] = body.state.epoch;
+    }
+    if (slow > 0 || late > 0) continue;
     // All frames are of this tick: every body that is somewhere is shown, as its owner tells it.
     for (RegionId r = 0; r < w.regions(); ++r) {
       for (const auto& [id, pose] : w.Truth(r)) {
