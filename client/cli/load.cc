@@ -16,6 +16,7 @@
 
 #include <absl/strings/str_cat.h>
 #include <absl/strings/str_format.h>
+#include <google/protobuf/io/coded_stream.h>
 #include <grpcpp/generic/generic_stub.h>
 #include <grpcpp/grpcpp.h>
 #include <nlohmann/json.hpp>
@@ -44,14 +45,10 @@ std::shared_ptr<grpc::Channel> Connect(const std::string& endpoint) {
 
 // The first field of a frame is its tick.
 int64_t TickOf(const grpc::Slice& frame) {
-  int64_t tick = 0;
-  if (frame.size() < 2 || *frame.begin() != 0x08) return 0;
-  int shift = 0;
-  for (const uint8_t* p = frame.begin() + 1; p != frame.end() && shift < 63; ++p, shift += 7) {
-    tick |= static_cast<int64_t>(*p & 0x7f) << shift;
-    if ((*p & 0x80) == 0) break;
-  }
-  return tick;
+  google::protobuf::io::CodedInputStream in(frame.begin(), static_cast<int>(frame.size()));
+  uint64_t tick = 0;
+  const bool first = in.ReadTag() == v1::ReplicaFrame::kTickFieldNumber << 3 && in.ReadVarint64(&tick);
+  return first ? static_cast<int64_t>(tick) : 0;
 }
 
 // One stream, whose frames are counted and not read.

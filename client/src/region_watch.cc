@@ -46,11 +46,6 @@ void RegionWatch::Want(const v1::StreamReplicasRequest& request) {
   if (stream_ != nullptr) stream_->Write(message);
 }
 
-void RegionWatch::Cut() {
-  const std::lock_guard lock(mutex_);
-  if (context_ != nullptr) context_->TryCancel();
-}
-
 void RegionWatch::Run() {
   const std::shared_ptr<grpc::Channel> channel = Connect(endpoint_);
   const auto stub = v1::Simulation::NewStub(channel);

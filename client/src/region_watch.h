@@ -28,8 +28,6 @@ class RegionWatch {
 
   // Changes the view, the rate or the level of detail.
   void Want(const v1::StreamReplicasRequest& request);
-  // Cuts the connection, as a network may. For tests.
-  void Cut();
 
  private:
   using Stream = grpc::ClientReaderWriter<v1::PlayRequest, v1::PlayResponse>;

@@ -6,21 +6,9 @@
 #include <grpcpp/impl/codegen/proto_utils.h>
 
 #include "server/transport/error_status.h"
+#include "server/transport/wire.h"
 
 namespace aureole {
-namespace {
-
-constexpr char kFrameTag = 1 << 3 | 2;  // field 1 of PlayResponse, with a length
-
-grpc::Slice FrameHead(size_t bytes) {
-  std::string head(1, kFrameTag);
-  for (; bytes >= 0x80; bytes >>= 7) head.push_back(static_cast<char>(bytes | 0x80));
-  head.push_back(static_cast<char>(bytes));
-  return grpc::Slice(head);
-}
-
-}  // namespace
-
 PlayStream::PlayStream(grpc::CallbackServerContext* context, InputService* inputs, ReplicaPublisher* replicas,
                        int64_t tick_us)
     : inputs_(inputs), replicas_(replicas), tick_us_(tick_us), context_(context) {}
@@ -56,7 +44,7 @@ ReplicaSubscriber::State PlayStream::Poll() {
 bool PlayStream::Send(const grpc::Slice& frame, Tick tick) {
   const std::lock_guard lock(mutex_);
   if (ended_ || done_ || writing_) return false;  // it may be writing outcomes
-  const grpc::Slice slices[] = {FrameHead(frame.size()), frame};
+  const grpc::Slice slices[] = {grpc::Slice(FieldHead(v1::PlayResponse::kFrameFieldNumber, frame.size())), frame};
   out_ = grpc::ByteBuffer(slices, 2);
   unacknowledged_.push_back(tick);
   if (!acknowledges_ && unacknowledged_.size() > kMostUnacknowledged) unacknowledged_.pop_front();

@@ -7,6 +7,7 @@
 #include <absl/container/flat_hash_set.h>
 
 #include "aureole/v1/simulation.pb.h"
+#include "server/transport/wire.h"
 
 namespace aureole {
 namespace {
@@ -20,16 +21,6 @@ constexpr size_t kMostNewBytes = size_t{1} << 20, kDescriptionBytes = 10;
 // Ticks after which what became of a body is forgotten, and seconds that the pace is taken over.
 constexpr Tick kKeptFates = 4096;
 constexpr std::chrono::seconds kPaceOver(1);
-
-constexpr char kCellsTag = 7 << 3 | 2;  // field 7 of ReplicaFrame, with a length
-
-void AppendField(char tag, const std::string& bytes, std::string* out) {
-  out->push_back(tag);
-  size_t n = bytes.size();
-  for (; n >= 0x80; n >>= 7) out->push_back(static_cast<char>(n | 0x80));
-  out->push_back(static_cast<char>(n));
-  out->append(bytes);
-}
 
 template <class List>
 auto FindCell(const List& cells, const CellKey& key) {
@@ -323,7 +314,7 @@ ReplicaPublisher::Frame ReplicaPublisher::MakeFrame(const Audience& audience, co
   std::vector<BodyId> entered, left;
   const auto add = [&](const CellState* before, const CellState* now) {
     const EncodedCell& cell = Encoded(before, now, format);
-    if (!cell.bytes.empty()) AppendField(kCellsTag, cell.bytes, &cells);
+    if (!cell.bytes.empty()) cells += FieldHead(v1::ReplicaFrame::kCellsFieldNumber, cell.bytes.size()) + cell.bytes;
     entered.insert(entered.end(), cell.entered.begin(), cell.entered.end());
     left.insert(left.end(), cell.left.begin(), cell.left.end());
   };

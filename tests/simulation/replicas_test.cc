@@ -90,7 +90,7 @@ class Watched {
  public:
   Watched(World world, const v1::StreamReplicasRequest& request,
           std::unique_ptr<Engine> (*make)(const Environment&) = MakeToyEngine)
-      : split_(std::move(world), make), message_(request) {
+      : split_(std::move(world), make) {
     const int n = split_.world().layout.size();
     for (RegionId r = 0; r < n; ++r) {
       publishers_.push_back(std::make_unique<ReplicaPublisher>());
@@ -145,7 +145,6 @@ class Watched {
 
  private:
   sim::Lockstep split_;
-  const v1::StreamReplicasRequest message_;
   std::vector<std::unique_ptr<ReplicaPublisher>> publishers_;
   std::vector<std::shared_ptr<Reader>> readers_;
   std::vector<ReplicaDecoder> decoders_;
