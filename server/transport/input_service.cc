@@ -51,21 +51,41 @@ void AddRejected(v1::Reason reason, uint64_t sequence, google::protobuf::Repeate
   it->set_count(it->count() + 1);
 }
 
-// One ApplyImpulses call. Its fields are guarded by the service's mutex; deletes itself.
-class InputService::ImpulseStream final : public grpc::ServerReadReactor<v1::ImpulseBatch>, public InputCaller {
+// What every call has. Its fields are guarded by the service's mutex; deletes itself.
+template <class Reactor>
+class InputService::Call : public Reactor, public InputCaller {
  public:
-  ImpulseStream(InputService* service, v1::ImpulseSummary* summary) : service_(service), summary_(summary) {}
+  explicit Call(InputService* service) : service_(service) {}
+
+  void End(const grpc::Status& status) final {
+    if (!std::exchange(ended_, true)) this->Finish(status);
+  }
+  void OnCancel() final {
+    const std::lock_guard lock(service_->mutex_);
+    End(grpc::Status::CANCELLED);
+  }
+  void OnDone() final {
+    {
+      const std::lock_guard lock(service_->mutex_);
+      service_->Remove(this);
+    }
+    delete this;
+  }
+
+ protected:
+  InputService* const service_;
+  bool ended_ = false;
+};
+
+// One ApplyImpulses call.
+class InputService::ImpulseStream final : public Call<grpc::ServerReadReactor<v1::ImpulseBatch>> {
+ public:
+  ImpulseStream(InputService* service, v1::ImpulseSummary* summary) : Call(service), summary_(summary) {}
 
   // Holds the mutex, as do all below but the reactions.
   void Read() {
     reading_ = true;
     StartRead(&batch_);
-  }
-
-  void End(const grpc::Status& status) override {
-    if (ended_) return;
-    ended_ = true;
-    Finish(status);
   }
 
   void Settle(const InputOutcome& outcome) override {
@@ -100,17 +120,6 @@ class InputService::ImpulseStream final : public grpc::ServerReadReactor<v1::Imp
     ++batches_;
     Continue();
   }
-  void OnCancel() override {
-    const std::lock_guard lock(service_->mutex_);
-    End(grpc::Status::CANCELLED);
-  }
-  void OnDone() override {
-    {
-      const std::lock_guard lock(service_->mutex_);
-      service_->Remove(this);
-    }
-    delete this;
-  }
 
  private:
   void Continue() {
@@ -119,25 +128,18 @@ class InputService::ImpulseStream final : public grpc::ServerReadReactor<v1::Imp
     if (all_read_ && waiting_ == 0) End(grpc::Status::OK);
   }
 
-  InputService* const service_;
   v1::ImpulseSummary* const summary_;
   v1::ImpulseBatch batch_;
   uint64_t client_ = 0;
   int batches_ = 0;
   size_t waiting_ = 0;  // outcomes
-  bool reading_ = false, all_read_ = false, ended_ = false;
+  bool reading_ = false, all_read_ = false;
 };
 
 // One call about bodies, each with a sequence of its own. As above.
-class InputService::BodiesCall : public grpc::ServerUnaryReactor, public InputCaller {
+class InputService::BodiesCall : public Call<grpc::ServerUnaryReactor> {
  public:
-  explicit BodiesCall(InputService* service) : service_(service) {}
-
-  void End(const grpc::Status& status) override {
-    if (ended_) return;
-    ended_ = true;
-    Finish(status);
-  }
+  using Call::Call;
 
   // `inputs`: one per body, with their sources, sequences growing by one.
   void Offer(std::vector<Input> inputs) {
@@ -159,24 +161,10 @@ class InputService::BodiesCall : public grpc::ServerUnaryReactor, public InputCa
     if (--waiting_ == 0) End(grpc::Status::OK);
   }
 
-  void OnCancel() override {
-    const std::lock_guard lock(service_->mutex_);
-    End(grpc::Status::CANCELLED);
-  }
-  void OnDone() override {
-    {
-      const std::lock_guard lock(service_->mutex_);
-      service_->Remove(this);
-    }
-    delete this;
-  }
-
  private:
   virtual void Note(const InputOutcome& outcome) = 0;
 
-  InputService* const service_;
   size_t waiting_ = 0;
-  bool ended_ = false;
 };
 
 class InputService::SpawnCall final : public BodiesCall {

@@ -64,6 +64,8 @@ class InputService {
  private:
   using Clock = std::chrono::steady_clock;
 
+  template <class Reactor>
+  class Call;
   class ImpulseStream;
   class BodiesCall;
   class SpawnCall;

@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "server/transport/error_status.h"
+#include "server/transport/shape_proto.h"
 
 namespace aureole {
 namespace {
@@ -29,12 +30,6 @@ std::vector<Ray> ReadRays(const v1::CastRaysRequest& request, SpecCheck* check) 
     out.push_back({from, from + direction * check->Positive(kLength, path[i] / "length", ray.length())});
   }
   return out;
-}
-
-void SetVec3(const Vec3& v, v1::Vec3* out) {
-  out->set_x(v.x());
-  out->set_y(v.y());
-  out->set_z(v.z());
 }
 
 }  // namespace

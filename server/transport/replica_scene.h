@@ -21,7 +21,6 @@ class ReplicaScene {
   void Apply(const Capture& capture);
 
   Tick tick() const { return tick_; }
-  size_t bodies() const { return bodies_.size(); }
   // Calls fn(const CellKey&) for every cell that has bodies, in no particular order.
   template <class Fn>
   void ForEachCell(Fn&& fn) const {

@@ -1,15 +1,12 @@
 #include "server/transport/shape_proto.h"
 
 namespace aureole {
-namespace {
 
 void SetVec3(const Vec3& v, v1::Vec3* out) {
   out->set_x(v.x());
   out->set_y(v.y());
   out->set_z(v.z());
 }
-
-}  // namespace
 
 v1::Shape ShapeToProto(const Shape& shape) {
   v1::Shape out;

@@ -1,4 +1,4 @@
-// Shapes and materials as clients see them, in the terms of a world file.
+// Vectors, shapes and materials as clients see them, in the terms of a world file.
 #pragma once
 
 #include "aureole/v1/world.pb.h"
@@ -6,6 +6,7 @@
 
 namespace aureole {
 
+void SetVec3(const Vec3& v, v1::Vec3* out);
 v1::Shape ShapeToProto(const Shape& shape);
 v1::Material MaterialToProto(const Material& material);
 
