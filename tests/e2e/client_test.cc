@@ -13,9 +13,8 @@
 #include <vector>
 
 #include "client/src/push_sender.h"
-#include "server/control/local_allocator.h"
-#include "server/control/run.h"
 #include "server/control/world_file.h"
+#include "tests/e2e/running_world.h"
 
 namespace aureole {
 namespace {
@@ -27,29 +26,10 @@ using namespace std::chrono_literals;
 
 using Play = std::function<void(const std::vector<std::string>& endpoints)>;
 
-void RunWorldOf(const v1::WorldSpec& world, int regions, const Play& play) {
-  RunOptions options;
-  options.world = world;
-  options.regions = regions;
-  LocalAllocator allocator({});
-  RunResult result;
-  const absl::Status end = RunWorld(
-      options, allocator,
-      [&](const RunStatus& status) {
-        if (status.stage != Stage::kRunning || status.MinTick() < 5) return true;
-        std::vector<std::string> endpoints;
-        for (const RegionStatus& r : status.regions) endpoints.push_back(r.endpoint);
-        play(endpoints);
-        return false;
-      },
-      &result);
-  EXPECT_EQ(end.code(), absl::StatusCode::kCancelled) << end;
-}
-
 void RunDemo(const Play& play) {
   absl::StatusOr<WorldFile> file = OpenWorldFile(AUREOLE_WORLDS "/demo.json", {});
   ASSERT_TRUE(file.ok()) << file.status();
-  RunWorldOf(file->spec, file->world.layout.size(), play);
+  PlayIn(file->spec, file->world.layout.size(), play);
 }
 
 // Weightless, three regions; bodies fly to and fro over the borders in lanes of their own.
@@ -114,7 +94,7 @@ TEST(Client, ShowsTheWholeWorldOverStreamsThatHold) {
 TEST(Client, PushesActOnceHoweverOftenTheConnectionIsCut) {
   static constexpr int kBodies = 16, kPushes = 20000;
   static constexpr double kPush = 1.0 / 1024;  // m/s: sums are exact
-  RunWorldOf(Lanes(kBodies), 3, [](const std::vector<std::string>& endpoints) {
+  PlayIn(Lanes(kBodies), 3, [](const std::vector<std::string>& endpoints) {
     client::PushSender sender(endpoints, 99);
     std::vector<double> expected(kBodies, 0);
     for (int n = 0; n < kPushes; ++n) {
@@ -151,7 +131,7 @@ TEST(Client, PushesActOnceHoweverOftenTheConnectionIsCut) {
 }
 
 TEST(Client, SpawnsPushesAndRemovesABodyThatItSees) {
-  RunWorldOf(Lanes(4), 3, [](const std::vector<std::string>& endpoints) {
+  PlayIn(Lanes(4), 3, [](const std::vector<std::string>& endpoints) {
     const std::unique_ptr<Client> client = Connected(endpoints[1]);
     ASSERT_TRUE(client->Watch({}).ok());
     client::NewBody box;
@@ -215,7 +195,7 @@ TEST(Client, SpawnsPushesAndRemovesABodyThatItSees) {
 }
 
 TEST(Client, SamplesMoveSmoothlyAcrossBorders) {
-  RunWorldOf(Lanes(4), 3, [](const std::vector<std::string>& endpoints) {
+  PlayIn(Lanes(4), 3, [](const std::vector<std::string>& endpoints) {
     const std::unique_ptr<Client> client = Connected(endpoints[0]);
     ASSERT_TRUE(client->Watch({}).ok());
     ASSERT_TRUE(client->WaitUntilComplete(10));

@@ -12,8 +12,7 @@
 
 #include "aureole/v1/simulation.grpc.pb.h"
 #include "client/src/replica_decoder.h"
-#include "server/control/local_allocator.h"
-#include "server/control/run.h"
+#include "tests/e2e/running_world.h"
 
 namespace aureole {
 namespace {
@@ -112,29 +111,7 @@ class Client {
 
 using Play = std::function<void(const std::vector<std::string>& endpoints)>;
 
-void RunWorldOf(const v1::WorldSpec& world, const Play& play) {
-  RunOptions options;
-  options.world = world;
-  options.regions = 4;
-  LocalAllocator allocator({});
-  RunResult result;
-  bool played = false;
-  const absl::Status end = RunWorld(
-      options, allocator,
-      [&](const RunStatus& status) {
-        if (status.stage != Stage::kRunning || status.MinTick() < 5) return true;
-        std::vector<std::string> endpoints;
-        for (const RegionStatus& r : status.regions) endpoints.push_back(r.endpoint);
-        play(endpoints);
-        played = true;
-        return false;
-      },
-      &result);
-  EXPECT_EQ(end.code(), absl::StatusCode::kCancelled) << end;
-  EXPECT_TRUE(played);
-}
-
-void RunLanes(const Play& play) { RunWorldOf(Lanes(), play); }
+void RunLanes(const Play& play) { PlayIn(Lanes(), 4, play); }
 
 void ExpectRefused(const grpc::Status& status, v1::Reason reason, const std::string& field) {
   EXPECT_EQ(status.error_code(), grpc::StatusCode::INVALID_ARGUMENT) << field;
@@ -184,7 +161,7 @@ TEST(Inputs, WhatIsNowhereOrTooMuchIsRejectedAloneWithTheReason) {
   v1::WorldSpec world = Lanes();
   world.mutable_client_limits()->set_impulse(100);
   world.mutable_client_limits()->set_rate(50);
-  RunWorldOf(world, [](const std::vector<std::string>& endpoints) {
+  PlayIn(world, 4, [](const std::vector<std::string>& endpoints) {
     Client client(endpoints[2]);
     std::vector<v1::Impulse> impulses{Push(1, 999), Push(2, 3), Push(3, 3)};
     impulses[2].mutable_impulse()->set_y(100);

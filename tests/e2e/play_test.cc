@@ -14,8 +14,7 @@
 
 #include "aureole/v1/simulation.grpc.pb.h"
 #include "client/src/replica_decoder.h"
-#include "server/control/local_allocator.h"
-#include "server/control/run.h"
+#include "tests/e2e/running_world.h"
 
 namespace aureole {
 namespace {
@@ -40,20 +39,7 @@ v1::WorldSpec Drift(int bodies) {
 }
 
 void RunDrift(int bodies, const std::function<void(const std::string& endpoint)>& play) {
-  RunOptions options;
-  options.world = Drift(bodies);
-  options.regions = 1;
-  LocalAllocator allocator({});
-  RunResult result;
-  const absl::Status end = RunWorld(
-      options, allocator,
-      [&](const RunStatus& status) {
-        if (status.stage != Stage::kRunning || status.MinTick() < 3) return true;
-        play(status.regions[0].endpoint);
-        return false;
-      },
-      &result);
-  EXPECT_EQ(end.code(), absl::StatusCode::kCancelled) << end;
+  PlayIn(Drift(bodies), 1, [&](const std::vector<std::string>& endpoints) { play(endpoints[0]); });
 }
 
 class Player {
