@@ -47,6 +47,7 @@ ReplicaRequest ReplicaRequest::Read(const Path& path, const v1::StreamReplicasRe
     check->Fail(path / "encoding", "must be COLUMNS with precision EXACT", v1::CONFLICT);
   }
   out.view = CellView(path / "view", request.view(), check);
+  if (check->ok()) out.cells = out.view.Cells(kMostCells);
   out.detail = DetailLevels(path / "level_of_detail", request.level_of_detail(), check);
   out.key = request.SerializeAsString();
   return out;
@@ -189,12 +190,11 @@ void ReplicaPublisher::ChooseWatch() {
       watch->periods.push_back(r.period);
     }
     if (watch->everything) continue;
-    const auto cells = r.view.Cells(kMostCells);
-    if (!cells.has_value() || watch->cells.size() + cells->size() > kMostCells) {
+    if (!r.cells.has_value() || watch->cells.size() + r.cells->size() > kMostCells) {
       watch->everything = true;
       watch->cells.clear();
     } else {
-      watch->cells.insert(cells->begin(), cells->end());
+      watch->cells.insert(r.cells->begin(), r.cells->end());
     }
   }
   subscribers_ = subscribers;
@@ -231,8 +231,8 @@ std::shared_ptr<const ReplicaPublisher::Shown> ReplicaPublisher::Show(const Audi
   auto out = std::make_shared<Shown>();
   out->tick = scene_.tick();
   std::vector<CellKey> cells;
-  if (auto listed = request.view.Cells(kMostCells); listed.has_value() && listed->size() < 4 * scene_.cells() + 64) {
-    cells = *std::move(listed);
+  if (request.cells.has_value() && request.cells->size() < 4 * scene_.cells() + 64) {
+    cells = *request.cells;
   } else {
     scene_.ForEachCell([&](const CellKey& key) {
       if (request.view.Selects(key)) cells.push_back(key);

@@ -32,6 +32,7 @@ struct ReplicaRequest {
   Tick period = 1;
   CellFormat format;
   CellView view;
+  std::optional<std::vector<CellKey>> cells;  // of the view; nothing when they are too many to list
   DetailLevels detail;
   std::string key;  // equal requests have equal keys
 
