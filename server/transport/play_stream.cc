@@ -86,38 +86,12 @@ void PlayStream::OnReadDone(bool ok) {
   const Path path = (Path() / "request")[requests_++];
   v1::PlayRequest request;
   grpc::Status refusal;
-  size_t taken = 0;
-  bool joins = false, asked = false;
+  bool joins = false;
   if (!grpc::SerializationTraits<v1::PlayRequest>::Deserialize(&in_, &request).ok()) {
     refusal = Refusal(grpc::StatusCode::INVALID_ARGUMENT, v1::BAD_VALUE, path.str(), "must be a PlayRequest");
   }
-  if (refusal.ok() && request.has_watch()) {
-    asked = true;
-    SpecCheck check;
-    ReplicaRequest wanted = ReplicaRequest::Read(path / "watch", request.watch(), tick_us_, &check);
-    const std::lock_guard lock(mutex_);
-    if (watching_ && wanted.format != format_) {
-      check.Fail(path / "watch", "must keep precision, velocities and encoding; open another stream to change them",
-                 v1::CONFLICT);
-    }
-    if (check.ok()) {
-      joins = !std::exchange(watching_, true);
-      format_ = wanted.format;
-      wanted_ = std::make_shared<const ReplicaRequest>(std::move(wanted));
-    } else {
-      refusal = Refusal(check);
-    }
-  }
-  if (refusal.ok() && request.has_inputs()) {
-    {
-      // Before they are offered: outcomes may come at once.
-      const std::lock_guard lock(mutex_);
-      waiting_ += static_cast<size_t>(request.inputs().impulse_size());
-    }
-    refusal = inputs_->Offer(this, path / "inputs", request.inputs(), &client_, &taken);
-    const std::lock_guard lock(mutex_);
-    waiting_ -= static_cast<size_t>(request.inputs().impulse_size()) - taken;
-  }
+  if (refusal.ok() && request.has_watch()) refusal = TakeWatch(path / "watch", request.watch(), &joins);
+  if (refusal.ok() && request.has_inputs()) refusal = TakeInputs(path / "inputs", request.inputs());
   std::shared_ptr<PlayStream> self;
   {
     const std::lock_guard lock(mutex_);
@@ -130,9 +104,38 @@ void PlayStream::OnReadDone(bool ok) {
   if (self == nullptr) return;
   if (joins) {
     replicas_->Join(self);
-  } else if (asked) {
+  } else if (request.has_watch()) {
     replicas_->Wake();
   }
+}
+
+// `joins`: it is the first wish of this stream.
+grpc::Status PlayStream::TakeWatch(const Path& path, const v1::StreamReplicasRequest& request, bool* joins) {
+  SpecCheck check;
+  ReplicaRequest wanted = ReplicaRequest::Read(path, request, tick_us_, &check);
+  const std::lock_guard lock(mutex_);
+  if (watching_ && wanted.format != format_) {
+    check.Fail(path, "must keep precision, velocities and encoding; open another stream to change them", v1::CONFLICT);
+  }
+  if (!check.ok()) return Refusal(check);
+  *joins = !std::exchange(watching_, true);
+  format_ = wanted.format;
+  wanted_ = std::make_shared<const ReplicaRequest>(std::move(wanted));
+  return grpc::Status::OK;
+}
+
+grpc::Status PlayStream::TakeInputs(const Path& path, const v1::ImpulseBatch& batch) {
+  const auto all = static_cast<size_t>(batch.impulse_size());
+  {
+    // Before they are offered: outcomes may come at once.
+    const std::lock_guard lock(mutex_);
+    waiting_ += all;
+  }
+  size_t taken = 0;
+  const grpc::Status refusal = inputs_->Offer(this, path, batch, &client_, &taken);
+  const std::lock_guard lock(mutex_);
+  waiting_ -= all - taken;
+  return refusal;
 }
 
 void PlayStream::OnWriteDone(bool ok) {

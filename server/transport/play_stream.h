@@ -44,6 +44,9 @@ class PlayStream final : public grpc::ServerBidiReactor<grpc::ByteBuffer, grpc::
   void OnCancel() override;
   void OnDone() override;
 
+  grpc::Status TakeWatch(const Path& path, const v1::StreamReplicasRequest& request, bool* joins);
+  grpc::Status TakeInputs(const Path& path, const v1::ImpulseBatch& batch);
+
   // All hold mutex_.
   void Finally(const grpc::Status& status);
   void Continue();
