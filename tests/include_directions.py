@@ -2,8 +2,8 @@
 """Holds the include directions: who may include whom, and what the core may not touch.
 
 server/core includes only itself, Abseil, Eigen and the standard library; physics -> core; transport -> core, proto;
-region -> core, physics, transport, proto; control -> core, transport, proto (the messages of the service it is);
-client -> proto (client/cli also server/control); tests may include everything, and nothing but tests includes tests.
+region, replay -> core, physics, transport, proto; control -> core, transport, proto (the messages of the service it is);
+client -> proto (client/cli also server/control, server/replay); tests may include everything, and nothing but tests includes tests.
 server/core and server/physics are pure functions of their inputs: no clock, thread, file, socket or random device.
 
 Usage: include_directions.py [--root DIR] | --self-test
@@ -21,9 +21,10 @@ ALLOWED = {
     "server/physics": {"server/physics", "server/core"},
     "server/transport": {"server/transport", "server/core", "proto"},
     "server/region": {"server/region", "server/core", "server/physics", "server/transport", "proto"},
+    "server/replay": {"server/replay", "server/core", "server/physics", "server/transport", "proto"},
     "server/control": {"server/control", "server/core", "server/transport", "proto"},
     "client": {"client", "proto"},
-    "client/cli": {"client/cli", "client", "proto", "server/control"},
+    "client/cli": {"client/cli", "client", "proto", "server/control", "server/replay"},
     "proto": {"proto"},
     "tests": None,  # everything
 }

@@ -4,9 +4,15 @@
 
 #include "client/cli/act.h"
 #include "client/cli/check.h"
+#include "client/cli/completion.h"
+#include "client/cli/doctor.h"
 #include "client/cli/exit_codes.h"
 #include "client/cli/experiment.h"
 #include "client/cli/load.h"
+#include "client/cli/record.h"
+#include "client/cli/replay.h"
+#include "client/cli/report.h"
+#include "client/cli/top.h"
 #include "client/cli/up.h"
 #include "client/cli/watch.h"
 #include "server/control/interrupts.h"
@@ -22,6 +28,8 @@ int main(int argc, char** argv) {
                          "  aureole experiment tests/worlds/paper/column-*.json\n"
                          "  aureole check tests/worlds/*.json\n"
                          "  aureole watch --server 127.0.0.1:40001\n"
+                         "  aureole record --server 127.0.0.1:40001 --out run.mcap --duration 10s\n"
+                         "  aureole replay run.mcap --verify\n"
                          "  aureole up --help\n\n") +
              aureole::kExitCodesHelp);
 
@@ -34,6 +42,12 @@ int main(int argc, char** argv) {
   aureole::RemoveOptions remove_options;
   aureole::RayOptions ray_options;
   aureole::WatchCliOptions watch_options;
+  aureole::RecordOptions record_options;
+  aureole::ReplayOptions replay_options;
+  aureole::ReportOptions report_options;
+  aureole::TopOptions top_options;
+  aureole::DoctorOptions doctor_options;
+  aureole::CompletionOptions completion_options;
   const CLI::App* up = aureole::AddUp(app, &up_options);
   const CLI::App* experiment = aureole::AddExperiment(app, &experiment_options);
   const CLI::App* watch = aureole::AddWatch(app, &watch_options);
@@ -41,7 +55,13 @@ int main(int argc, char** argv) {
   const CLI::App* spawn = aureole::AddSpawn(app, &spawn_options);
   const CLI::App* ray = aureole::AddRay(app, &ray_options);
   const CLI::App* remove = aureole::AddRemove(app, &remove_options);
+  const CLI::App* top = aureole::AddTop(app, &top_options);
+  const CLI::App* record = aureole::AddRecord(app, &record_options);
+  const CLI::App* replay = aureole::AddReplay(app, &replay_options);
+  const CLI::App* report = aureole::AddReport(app, &report_options);
   const CLI::App* load = aureole::AddLoad(app, &load_options);
+  const CLI::App* doctor = aureole::AddDoctor(app, &doctor_options);
+  const CLI::App* completion = aureole::AddCompletion(app, &completion_options);
   aureole::AddCheck(app, &check_options);
   try {
     app.parse(argc, argv);
@@ -55,6 +75,12 @@ int main(int argc, char** argv) {
   if (spawn->parsed()) return aureole::RunSpawn(spawn_options);
   if (ray->parsed()) return aureole::RunRay(ray_options);
   if (remove->parsed()) return aureole::RunRemove(remove_options);
+  if (top->parsed()) return aureole::RunTop(top_options);
+  if (doctor->parsed()) return aureole::RunDoctor(doctor_options);
+  if (completion->parsed()) return aureole::RunCompletion(app, completion_options);
+  if (record->parsed()) return aureole::RunRecord(record_options);
+  if (replay->parsed()) return aureole::RunReplay(replay_options);
+  if (report->parsed()) return aureole::RunReport(report_options);
   if (load->parsed()) return aureole::RunLoad(load_options);
   return aureole::Check(check_options);
 }

@@ -13,6 +13,7 @@ namespace {
 
 constexpr double kPlotWidth = 520, kPlotHeight = 340;
 constexpr double kLeft = 64, kTop = 76, kBottom = 56, kLegendWidth = 150;
+constexpr size_t kMostMarkers = 60;  // of one curve
 constexpr double kChartWidth = kLeft + kPlotWidth + kLegendWidth;
 constexpr double kHeight = kTop + kPlotHeight + kBottom;
 constexpr double kLegendRow = 19;
@@ -80,7 +81,7 @@ void AddSeries(std::string* svg, const Series& series, const Scale& scale, const
   std::string points;
   for (const auto& [x, y] : series.points) absl::StrAppendFormat(&points, "%.1f,%.1f ", scale.X(x), scale.Y(y));
   absl::StrAppend(svg, "<polyline fill=\"none\" points=\"", points, "\" ", Stroke(series, colour), "/>\n");
-  if (series.ideal) return;
+  if (series.ideal || series.points.size() > kMostMarkers) return;
   for (const auto& [x, y] : series.points) {
     absl::StrAppendFormat(svg, "<circle cx=\"%.1f\" cy=\"%.1f\" r=\"2.6\" fill=\"%s\"/>\n", scale.X(x), scale.Y(y),
                           colour);
@@ -126,15 +127,23 @@ std::vector<double> RoundTicks(double largest, int most) {
   return Multiples(step, largest);
 }
 
-std::string RenderSvg(const std::string& title, const std::vector<Chart>& charts) {
-  const double width = kChartWidth * static_cast<double>(charts.size());
+std::string RenderSvg(const std::string& title, const std::vector<Chart>& charts, int per_row) {
+  const size_t columns = per_row > 0 ? std::min(charts.size(), static_cast<size_t>(per_row)) : charts.size();
+  const size_t rows = columns == 0 ? 1 : (charts.size() + columns - 1) / columns;
+  const double width = kChartWidth * static_cast<double>(columns), height = kHeight * static_cast<double>(rows);
   std::string svg = absl::StrFormat(
       "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"%.0f\" height=\"%.0f\" viewBox=\"0 0 %.0f %.0f\" "
       "font-family=\"Helvetica, Arial, sans-serif\" fill=\"#222222\">\n"
       "<rect width=\"100%%\" height=\"100%%\" fill=\"white\"/>\n",
-      width, kHeight, width, kHeight);
+      width, height, width, height);
   AddText(&svg, width / 2, 28, "middle", 18, title);
-  for (size_t i = 0; i < charts.size(); ++i) AddChart(&svg, charts[i], kChartWidth * static_cast<double>(i));
+  for (size_t row = 0; row < rows; ++row) {
+    if (row > 0) svg += absl::StrFormat("<g transform=\"translate(0 %.0f)\">\n", kHeight * static_cast<double>(row));
+    for (size_t i = row * columns; i < std::min(charts.size(), (row + 1) * columns); ++i) {
+      AddChart(&svg, charts[i], kChartWidth * static_cast<double>(i - row * columns));
+    }
+    if (row > 0) svg += "</g>\n";
+  }
   return svg + "</svg>\n";
 }
 

@@ -20,8 +20,9 @@ struct Chart {
   std::vector<Series> series;    // non-negative values
 };
 
-// A document with the charts side by side under `title`. The axes start at 0 and end at a round number.
-std::string RenderSvg(const std::string& title, const std::vector<Chart>& charts);
+// A document with the charts side by side under `title`, so many in a row (0: all). The axes start at 0 and end at a
+// round number.
+std::string RenderSvg(const std::string& title, const std::vector<Chart>& charts, int per_row = 0);
 
 // Multiples of 1, 2 or 5 times a power of ten from 0 that cover `largest` with at most `most` intervals: 0, 5, 10, 15.
 std::vector<double> RoundTicks(double largest, int most);

@@ -4,7 +4,10 @@
 
 #include <cstdio>
 #include <iostream>
+#include <memory>
+#include <string>
 #include <utility>
+#include <vector>
 
 #include <absl/strings/str_format.h>
 #include <nlohmann/json.hpp>
@@ -12,6 +15,7 @@
 #include "client/cli/exit_codes.h"
 #include "client/cli/flags.h"
 #include "client/cli/live_table.h"
+#include "client/cli/viewer_process.h"
 #include "server/control/interrupts.h"
 #include "server/control/local_allocator.h"
 #include "server/control/run.h"
@@ -30,18 +34,22 @@ constexpr Tick kDefaultHashEvery = 100;
 // Shows a run while it goes on: a table in place on a terminal, else a line each second.
 class Display {
  public:
-  Display(Heading heading, bool quiet)
-      : heading_(std::move(heading)), quiet_(quiet), terminal_(isatty(STDOUT_FILENO)) {}
+  Display(Heading heading, bool quiet, std::string viewer)
+      : heading_(std::move(heading)), quiet_(quiet), terminal_(isatty(STDOUT_FILENO)), viewer_(std::move(viewer)) {}
 
   // False when nobody reads on.
   bool Show(const RunStatus& status) {
+    RunViewer(status);
     if (quiet_) return true;
     const auto now = Clock::now();
     if (now < next_ && status.stage != Stage::kFinished) return true;
     next_ = now + (terminal_ ? std::chrono::milliseconds(kRedrawEvery) : std::chrono::milliseconds(kLineEvery));
     if (terminal_) {
-      screen_.Draw(TableLines(heading_, status));
+      std::vector<std::string> lines = TableLines(heading_, status);
+      if (!viewer_says_.empty()) lines.push_back(viewer_says_);
+      screen_.Draw(lines);
     } else {
+      if (!viewer_says_.empty()) std::printf("%s\n", std::exchange(viewer_says_, "").c_str());
       if (status.stage >= Stage::kRunning && !std::exchange(named_, true)) {
         std::printf("%s\n", ServersLine(status).c_str());
       }
@@ -51,8 +59,29 @@ class Display {
   }
 
  private:
+  // Starts it once there are servers.
+  void RunViewer(const RunStatus& status) {
+    if (viewer_.empty() || status.stage < Stage::kRunning) return;
+    if (process_ == nullptr && viewer_says_.empty()) {
+      absl::StatusOr<std::unique_ptr<ViewerProcess>> started =
+          ViewerProcess::Start(viewer_, status.regions[0].endpoint);
+      if (started.ok()) {
+        process_ = *std::move(started);
+      } else {
+        viewer_says_ = std::string(started.status().message());
+        viewer_.clear();
+      }
+    }
+    if (process_ == nullptr) return;
+    const std::string said = process_->TakeLines();
+    const size_t end = said.find('\n');
+    if (end != std::string::npos) viewer_says_ = said.substr(0, end);
+  }
+
   const Heading heading_;
   const bool quiet_, terminal_;
+  std::string viewer_, viewer_says_;
+  std::unique_ptr<ViewerProcess> process_;
   bool named_ = false;  // the servers
   Screen screen_{stdout};
   Clock::time_point next_{};
@@ -147,6 +176,9 @@ CLI::App* AddUp(CLI::App& app, UpOptions* o) {
   up->add_option("--logs", o->logs, "Keep the servers' logs in this directory")->type_name("DIR");
   up->add_option("--region-server", o->region_server, "Program to start; aureole-region beside this one when not given")
       ->type_name("FILE");
+  up->add_option("--viewer", o->viewer,
+                 "Directory of the browser viewer (client/viewer): serves it, and prints its address")
+      ->type_name("DIR");
   up->footer(std::string("Examples:\n"
                          "  aureole up tests/worlds/demo.json\n"
                          "  aureole up tests/worlds/paper/column-4.json --duration 60s --json > result.json\n"
@@ -174,7 +206,7 @@ int Up(const UpOptions& options) {
   run.hash_every = options.hash_every >= 0 ? options.hash_every : heading.last_tick > 0 ? kDefaultHashEvery : 0;
 
   LocalAllocator allocator({options.region_server, options.logs, options.verbose});
-  Display display(heading, options.json);
+  Display display(heading, options.json, options.viewer);
   RunResult result;
   const absl::Status status = RunWorld(
       run, allocator, [&display](const RunStatus& now) { return display.Show(now) && Interrupts() == 0; }, &result);

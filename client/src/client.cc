@@ -144,6 +144,7 @@ struct Client::Impl {
   double offset = std::numeric_limits<double>::quiet_NaN();
   int64_t newest = 0;
 
+  std::mutex watches_mutex;
   std::vector<std::unique_ptr<RegionWatch>> watches;  // last: ends first
 };
 
@@ -239,11 +240,15 @@ Status Client::Watch(const WatchOptions& options) {
     return {3, "rect: must not end before it begins", "BAD_VALUE", "rect"};
   }
   const v1::StreamReplicasRequest request = RequestOf(options);
+  const std::lock_guard watching(impl_->watches_mutex);
   if (!impl_->watches.empty()) {
     for (auto& watch : impl_->watches) watch->Want(request);
     return {};
   }
-  impl_->streams.resize(impl_->world.regions.size());
+  {
+    const std::lock_guard lock(impl_->mutex);
+    impl_->streams.resize(impl_->world.regions.size());
+  }
   for (size_t r = 0; r < impl_->world.regions.size(); ++r) {
     RegionWatch::Events events;
     events.frame = [impl = impl_.get(), r](const v1::ReplicaFrame& frame, const ReplicaDecoder& decoder, bool fresh) {

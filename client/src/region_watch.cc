@@ -41,9 +41,7 @@ RegionWatch::~RegionWatch() {
 void RegionWatch::Want(const v1::StreamReplicasRequest& request) {
   const std::lock_guard lock(mutex_);
   request_ = request;
-  v1::PlayRequest message;
-  *message.mutable_watch() = request;
-  if (stream_ != nullptr) stream_->Write(message);
+  changed_ = true;
 }
 
 void RegionWatch::Run() {
@@ -51,23 +49,18 @@ void RegionWatch::Run() {
   const auto stub = v1::Simulation::NewStub(channel);
   std::chrono::milliseconds backoff = kMinBackoff;
   while (true) {
-    std::unique_ptr<Stream> stream;
+    std::shared_ptr<grpc::ClientContext> context;
+    v1::PlayRequest first;
     {
       const std::lock_guard lock(mutex_);
       if (ended_) return;
-      context_ = std::make_shared<grpc::ClientContext>();
-      stream = stub->Play(context_.get());
-      v1::PlayRequest message;
-      *message.mutable_watch() = request_;
-      stream->Write(message);
-      stream_ = stream.get();
+      context = context_ = std::make_shared<grpc::ClientContext>();
+      *first.mutable_watch() = request_;
+      changed_ = false;
     }
-    Read(stream.get());
-    {
-      const std::lock_guard lock(mutex_);
-      stream_ = nullptr;
-      context_->TryCancel();
-    }
+    const std::unique_ptr<Stream> stream = stub->Play(context.get());
+    if (stream->Write(first)) Read(stream.get(), first.watch());
+    context->TryCancel();
     const grpc::Status status = stream->Finish();
     events_.connection(false);
     std::unique_lock lock(mutex_);
@@ -77,8 +70,9 @@ void RegionWatch::Run() {
   }
 }
 
-void RegionWatch::Read(Stream* stream) {
-  ReplicaDecoder decoder(request_.precision(), request_.velocities());
+// Writes are of this thread alone and wait for nobody else: a new wish goes with the next acknowledgement.
+void RegionWatch::Read(Stream* stream, const v1::StreamReplicasRequest& request) {
+  ReplicaDecoder decoder(request.precision(), request.velocities());
   bool up = false, complete = false;
   std::string error;
   v1::PlayResponse response;
@@ -89,10 +83,13 @@ void RegionWatch::Read(Stream* stream) {
     const bool fresh = !complete && !response.frame().more();
     complete |= fresh;
     events_.frame(response.frame(), decoder, fresh);
-    v1::PlayRequest acknowledge;
-    acknowledge.set_acknowledged_tick(decoder.tick());
-    const std::lock_guard lock(mutex_);
-    if (!stream->Write(acknowledge)) return;
+    v1::PlayRequest answer;
+    answer.set_acknowledged_tick(decoder.tick());
+    {
+      const std::lock_guard lock(mutex_);
+      if (std::exchange(changed_, false)) *answer.mutable_watch() = request_;
+    }
+    if (!stream->Write(answer)) return;
   }
 }
 

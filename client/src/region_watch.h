@@ -33,15 +33,15 @@ class RegionWatch {
   using Stream = grpc::ClientReaderWriter<v1::PlayRequest, v1::PlayResponse>;
 
   void Run();
-  void Read(Stream* stream);
+  void Read(Stream* stream, const v1::StreamReplicasRequest& request);
 
   const std::string endpoint_;
   const Events events_;
   std::mutex mutex_;
   std::condition_variable ended_changed_;
   v1::StreamReplicasRequest request_;
+  bool changed_ = false;  // request_ is not yet told
   std::shared_ptr<grpc::ClientContext> context_;
-  Stream* stream_ = nullptr;  // may be written to
   bool ended_ = false;
   std::thread thread_;
 };

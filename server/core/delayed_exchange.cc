@@ -3,6 +3,8 @@
 
 #include <algorithm>
 
+#include <absl/container/flat_hash_set.h>
+
 #include "server/core/apply_input.h"
 #include "server/core/check.h"
 
@@ -59,6 +61,15 @@ void DelayedExchange::Advance(std::vector<Frame>* out) {
   Detect();
   BoundaryNetworkUpdate(out);
   phase_ = Phase::kBegin;
+}
+
+void DelayedExchange::AppendAuras(size_t most, std::vector<WireBox>* out) const {
+  absl::flat_hash_set<BodyId> seen;
+  for (const auto& [peer, told] : told_) {
+    for (const auto& [id, aura] : told) {
+      if (seen.size() < most && seen.insert(id).second) out->push_back(aura.box);
+    }
+  }
 }
 
 void DelayedExchange::ObserveInFlight(std::vector<BodyRecord>* out) const {

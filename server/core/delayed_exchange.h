@@ -40,6 +40,7 @@ class DelayedExchange final : public Protocol {
   void Advance(std::vector<Frame>* out) override;
 
   void ObserveInFlight(std::vector<BodyRecord>* out) const override;
+  void AppendAuras(size_t most, std::vector<WireBox>* out) const override;
 
  private:
   // R12: what a body can do within the horizon, and what its aura says of it.

@@ -121,9 +121,10 @@ class Engine {
   virtual int64_t CountAwake() const = 0;  // constant time
   // The nearest body on the way, static and kinematic ones too; nothing when there is none.
   virtual std::optional<RayHit> CastRay(const Vec3& from, const Vec3& to) const = 0;
-  // From here on, bodies that fall asleep are noted; and those noted since the last call, appended in no order.
-  virtual void NoteSleepers(bool on) = 0;
-  virtual void TakeSleepers(std::vector<BodyId>* out) = 0;
+  // From here on, bodies that fall asleep or wake up are noted; and those noted since the last call, appended in no
+  // order.
+  virtual void NoteSleep(bool on) = 0;
+  virtual void TakeSleep(std::vector<BodyId>* slept, std::vector<BodyId>* woke) = 0;
   // Largest BodyView::radius of any body that ever was here.
   virtual double MaxRadius() const = 0;
 

@@ -102,6 +102,8 @@ class Protocol {
   // Appends what is in flight from here: stepped by nobody's engine in tick `tick() + 1` (before its step), or in state
   // `tick()`.
   virtual void ObserveInFlight(std::vector<BodyRecord>* out) const = 0;
+  // Appends at most so many of the boxes that peers hold of bodies here, each body once.
+  virtual void AppendAuras(size_t most, std::vector<WireBox>* out) const = 0;
 };
 
 std::unique_ptr<Protocol> MakeSyncExchange(Holdings& holdings);

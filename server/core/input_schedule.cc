@@ -19,6 +19,14 @@ void InputSchedule::AppendDue(Tick n, std::vector<Input>* out) const {
   }
 }
 
+void InputSchedule::AppendAfter(Tick n, std::vector<Input>* out) const {
+  for (auto it = due_.upper_bound(n); it != due_.end(); ++it)
+    out->insert(out->end(), it->second.begin(), it->second.end());
+  for (const Input& input : lasting_) {
+    if (input.tick <= n && input.tick + input.ticks - 1 > n) out->push_back(input);
+  }
+}
+
 const Input* InputSchedule::FindSpawn(Tick n, BodyId body) const {
   const auto due = due_.find(n);
   if (due == due_.end()) return nullptr;

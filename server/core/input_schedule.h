@@ -13,6 +13,8 @@ class InputSchedule {
   void Add(const Input& input);
   // What acts at tick n, appended, in no particular order; of a force, one impulse.
   void AppendDue(Tick n, std::vector<Input>* out) const;
+  // What acts after tick n, as it was added, appended.
+  void AppendAfter(Tick n, std::vector<Input>* out) const;
   // The spawn of this body at tick n; null when there is none.
   const Input* FindSpawn(Tick n, BodyId body) const;
   // Forgets what acted before tick n and acts no more.

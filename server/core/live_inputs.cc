@@ -1,6 +1,5 @@
 #include "server/core/live_inputs.h"
 
-#include <algorithm>
 #include <cmath>
 #include <memory>
 
@@ -10,6 +9,12 @@
 
 namespace aureole {
 namespace {
+
+size_t BytesOf(const Shape& shape) {
+  size_t bytes = 128 + sizeof(Vec3) * shape.points.size();
+  for (const ChildShape& child : shape.children) bytes += 128 + BytesOf(*child.shape);
+  return bytes;
+}
 
 absl::Status CheckArea(const Input& input) {
   const Area& a = input.area;
@@ -52,6 +57,13 @@ absl::Status CheckLiveInput(const Input& input) {
   return absl::OkStatus();
 }
 
+size_t BytesOf(const Input& input, const Input* before) {
+  constexpr size_t kPlain = 192, kBody = 320;
+  if (input.spawn == nullptr) return kPlain;
+  const bool same = before != nullptr && before->spawn != nullptr && before->spawn->shape == input.spawn->shape;
+  return kBody + (same ? 0 : BytesOf(*input.spawn->shape));
+}
+
 absl::Status LiveInputs::Offer(const Input& input) {
   if (absl::Status s = CheckLiveInput(input); !s.ok()) return s;
   offered_.push_back(input);
@@ -59,45 +71,78 @@ absl::Status LiveInputs::Offer(const Input& input) {
 }
 
 std::vector<Input> LiveInputs::TakeOffered() {
-  const auto end = offered_.begin() + static_cast<std::ptrdiff_t>(std::min(offered_.size(), kMostPerTick));
-  std::vector<Input> out(offered_.begin(), end);
-  offered_.erase(offered_.begin(), end);
+  std::vector<Input> out;
+  int cost = 0;
+  size_t bytes = 0;
+  while (!offered_.empty()) {
+    const Input& next = offered_.front();
+    cost += CostOf(next);
+    bytes += BytesOf(next, out.empty() ? nullptr : &out.back());
+    if (!out.empty() && (cost > kMostPerTick || bytes > kMostBytesPerTick)) break;
+    out.push_back(next);
+    offered_.pop_front();
+  }
   return out;
 }
 
 void LiveInputs::Deliver(const std::vector<Input>& inputs, Tick effect, Tick spawn_effect, bool mine) {
   for (const Input& told : inputs) {
-    Source& source = sources_[told.source];
+    const bool spawn = told.kind == Input::Kind::kSpawn;
     const InputName name{told.source, told.sequence};
-    if (told.sequence <= source.last) {
-      if (mine) Repeated(source, name);
+    const Tick tick = spawn ? spawn_effect : effect;
+    Source* source = Find(told.source, tick);
+    if (source == nullptr) {
+      if (mine) outcomes_.push_back({.name = name, .tick = tick, .full = true});
       continue;
     }
-    source.last = told.sequence;
+    if (told.sequence <= source->last) {
+      if (mine) Repeated(name);
+      continue;
+    }
+    source->last = told.sequence;
+    Open& open = open_[{tick, name}];
+    open.mine = mine ? 1 : 0;
+    open.over_area = told.over_area();
+    open.removes_live = told.kind == Input::Kind::kRemove && IsLiveId(told.body);
+    open.full = spawn && bodies_ >= limits_.bodies;
+    effect_[name] = tick;
+    if (open.full) continue;
     Input input = told;
-    input.tick = effect;
-    if (input.kind == Input::Kind::kSpawn) {
+    input.tick = tick;
+    if (spawn) {
+      ++bodies_;
       auto body = std::make_shared<BodySpec>(*told.spawn);
-      body->id = input.body = next_body_++;
+      body->id = input.body = open.spawned = next_body_++;
       input.spawn = std::move(body);
-      input.tick = spawn_effect;
     }
     due_.Add(input);
-    open_[{input.tick, name}] = {0, input.over_area(), input.spawn != nullptr ? input.body : 0, mine ? 1 : 0};
-    effect_[name] = input.tick;
     delivered_.push_back(std::move(input));
   }
 }
 
+// Null when there are too many and all have spoken of late.
+LiveInputs::Source* LiveInputs::Find(uint64_t id, Tick effect) {
+  if (!sources_.contains(id) && sources_.size() >= limits_.clients) {
+    const auto [heard, silent] = *by_silence_.begin();
+    if (heard + kKeptTicks >= effect) return nullptr;
+    sources_.erase(silent);
+    by_silence_.erase(by_silence_.begin());
+  }
+  Source& source = sources_[id];
+  by_silence_.erase({source.heard, id});
+  source.heard = effect;
+  by_silence_.emplace(effect, id);
+  return &source;
+}
+
 // A repeated input gets the outcome of the first; when that is no longer kept, it is told as not applied at tick 0.
-void LiveInputs::Repeated(const Source& source, const InputName& name) {
+void LiveInputs::Repeated(const InputName& name) {
   if (auto it = effect_.find(name); it != effect_.end()) {
     ++open_.at({it->second, name}).mine;
     return;
   }
-  const auto it = std::find_if(source.recent.begin(), source.recent.end(),
-                               [&name](const InputOutcome& o) { return o.name == name; });
-  outcomes_.push_back(it != source.recent.end() ? *it : InputOutcome{name});
+  const auto it = outcome_of_.find(name);
+  outcomes_.push_back(it != outcome_of_.end() ? it->second : InputOutcome{name});
 }
 
 void LiveInputs::Applied(const Input& input, int64_t bodies) {
@@ -113,27 +158,28 @@ void LiveInputs::Heard(const std::vector<AppliedInput>& applied) {
     AUREOLE_CHECK(open.bodies == 0 || open.over_area, "input %llu of source %llu was applied twice",
                   static_cast<unsigned long long>(name.second), static_cast<unsigned long long>(name.first));
     open.bodies += bodies;
+    if (open.removes_live) bodies_ -= bodies;
   }
 }
 
 void LiveInputs::Settle(Tick n) {
   while (!open_.empty() && open_.begin()->first.first <= n) {
     const auto& [key, open] = *open_.begin();
-    const InputOutcome outcome{key.second, key.first, open.bodies, open.spawned};
+    const InputOutcome outcome{key.second, key.first, open.bodies, open.spawned, open.full};
     outcomes_.insert(outcomes_.end(), static_cast<size_t>(open.mine), outcome);
-    Source& source = sources_.at(outcome.name.first);
-    source.recent.push_back(outcome);
-    if (source.recent.size() > kKeptOutcomes) source.recent.pop_front();
+    Keep(outcome);
     effect_.erase(outcome.name);
     open_.erase(open_.begin());
   }
-  if (n % kKeptTicks == 0) ForgetOutcomes(n);
+  while (!recent_.empty() && (recent_.front().tick + kKeptTicks < n || recent_.size() > limits_.outcomes)) {
+    outcome_of_.erase(recent_.front().name);
+    recent_.pop_front();
+  }
 }
 
-void LiveInputs::ForgetOutcomes(Tick n) {
-  for (auto& [id, source] : sources_) {
-    if (!source.recent.empty() && source.recent.back().tick + kKeptTicks < n) source.recent = {};
-  }
+// A client that was forgotten may use a sequence again.
+void LiveInputs::Keep(const InputOutcome& outcome) {
+  if (outcome_of_.insert_or_assign(outcome.name, outcome).second) recent_.push_back(outcome);
 }
 
 }  // namespace aureole

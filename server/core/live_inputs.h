@@ -2,20 +2,24 @@
 //
 // Every region hears the same inputs in the same order, so all know from the same tick on what will act and when, and
 // it does not matter where a body is or who moves it meanwhile. Of each source only sequences that grow count: what a
-// client repeats, here or at another region, acts once. Whoever applies an input says so with the exchange, so that
-// every region knows what became of it.
+// client repeats, here or at another region, acts once. What is remembered is bounded, by the same rule everywhere:
+// when there are too many clients, the one that was silent for longest is forgotten, but none that has just spoken.
+// Whoever applies an input says so with the exchange, so that every region knows what became of it.
 #pragma once
 
 #include <cstdint>
 #include <deque>
 #include <map>
+#include <set>
 #include <utility>
 #include <vector>
 
+#include <absl/container/flat_hash_map.h>
 #include <absl/status/status.h>
 
 #include "server/core/frame.h"
 #include "server/core/input_schedule.h"
+#include "server/core/limits.h"
 #include "server/core/scene.h"
 
 namespace aureole {
@@ -26,6 +30,7 @@ struct InputOutcome {
   Tick tick = 0;       // at whose start it took effect, or would have; 0: no longer known
   int64_t bodies = 0;  // on which it acted, in its first tick; 0: what it named was nowhere then
   BodyId body = 0;     // a spawn's
+  bool full = false;   // it does not act, since the world has as many clients, or bodies of clients, as it may
 
   bool applied() const { return bodies > 0; }
   friend bool operator==(const InputOutcome&, const InputOutcome&) = default;
@@ -40,19 +45,33 @@ inline constexpr Tick kMostInputTicks = 100'000;
 // InvalidArgument when it cannot be an input of a client: not finite, without a target, no valid kind.
 absl::Status CheckLiveInput(const Input& input);
 
+// What an input costs beside others: one over an area as much as many, since it may act on many bodies.
+inline int CostOf(const Input& input) { return input.over_area() ? 64 : 1; }
+// About how many bytes it takes when it is told after `before` (null: first): copies of a body share their shape.
+size_t BytesOf(const Input& input, const Input* before);
+
+// How much may be remembered. The same in all regions of a world.
+struct LiveLimits {
+  size_t clients = size_t{1} << 16;
+  int64_t bodies = limits::kMaxBodies;  // of clients, at once
+  size_t outcomes = size_t{1} << 18;    // for those who repeat inputs
+};
+
 class LiveInputs {
  public:
-  // Most inputs that a region tells in one tick; more wait for the next.
-  static constexpr size_t kMostPerTick = 1024;
-  // Outcomes kept of each source, for what it repeats, and ticks after which those of a source that says nothing go.
-  static constexpr size_t kKeptOutcomes = 8192;
+  // What a region tells in one tick, by CostOf and BytesOf; more waits for the next. Always one input at least.
+  static constexpr int kMostPerTick = 1024;
+  static constexpr size_t kMostBytesPerTick = size_t{1} << 20;
+  // Outcomes are kept for so many ticks, and clients that say nothing at least so long.
   static constexpr Tick kKeptTicks = 4096;
+
+  explicit LiveInputs(LiveLimits limits = {}) : limits_(limits) {}
 
   // Takes an input for the next exchange, after CheckLiveInput.
   absl::Status Offer(const Input& input);
   size_t offered() const { return offered_.size(); }
 
-  // At most kMostPerTick of what was offered, in order, to be told to all.
+  // Of what was offered, in order, what may be told to all in one tick.
   std::vector<Input> TakeOffered();
   // What a region told; it takes effect at tick `effect`, a spawn at tick `spawn_effect`. Called alike in every region:
   // same order, same ticks. `mine`: this region told it.
@@ -78,24 +97,32 @@ class LiveInputs {
  private:
   struct Source {
     uint64_t last = 0;  // sequence delivered
-    std::deque<InputOutcome> recent;
+    Tick heard = 0;     // when it took effect
   };
   struct Open {
     int64_t bodies = 0;
     bool over_area = false;
+    bool removes_live = false;  // a body that a client spawned
+    bool full = false;
     BodyId spawned = 0;
     int mine = 0;  // how often it was offered here
   };
 
-  void Repeated(const Source& source, const InputName& name);
-  void ForgetOutcomes(Tick n);
+  Source* Find(uint64_t source, Tick effect);
+  void Repeated(const InputName& name);
+  void Keep(const InputOutcome& outcome);
 
+  const LiveLimits limits_;
   std::deque<Input> offered_;
   InputSchedule due_;
+  int64_t bodies_ = 0;  // of clients
   BodyId next_body_ = kFirstLiveId;
   std::map<std::pair<Tick, InputName>, Open> open_;  // not settled
   std::map<InputName, Tick> effect_;                 // of these
-  std::map<uint64_t, Source> sources_;
+  absl::flat_hash_map<uint64_t, Source> sources_;
+  std::set<std::pair<Tick, uint64_t>> by_silence_;           // when each was heard last
+  std::deque<InputOutcome> recent_;                          // ticks ascend
+  absl::flat_hash_map<InputName, InputOutcome> outcome_of_;  // of these
   std::vector<AppliedInput> applied_;
   std::vector<InputOutcome> outcomes_;
   std::vector<Input> delivered_;

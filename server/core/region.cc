@@ -112,6 +112,7 @@ void Region::Advance(std::vector<Frame>* out) {
 }
 
 absl::Status Region::Submit(const Input& input) { return impl_->holdings.live.Offer(input); }
+size_t Region::inputs_waiting() const { return impl_->holdings.live.offered(); }
 std::vector<InputOutcome> Region::TakeOutcomes() { return impl_->holdings.live.TakeOutcomes(); }
 std::vector<Input> Region::TakeDelivered() { return impl_->holdings.live.TakeDelivered(); }
 
@@ -131,16 +132,27 @@ uint64_t Region::StateHash() const {
   return sum;
 }
 
+RegionSnapshot Region::Snapshot() const {
+  const Holdings& h = impl_->holdings;
+  AUREOLE_CHECK(h.world.exchange.k == 0 && phase() == Phase::kBegin, "snapshot of region %d within tick %lld", h.self,
+                static_cast<long long>(h.tick));
+  RegionSnapshot out{h.engine->Save(h.engine->Ids()), {}};
+  h.live.due().AppendAfter(h.tick, &out.to_come);
+  return out;
+}
+
+void Region::AppendAuras(size_t most, std::vector<WireBox>* out) const { impl_->protocol->AppendAuras(most, out); }
+
 void Region::WatchChanges(bool on) {
   Holdings& h = impl_->holdings;
   h.watched = on;
   h.changes = {};
-  h.engine->NoteSleepers(on);
+  h.engine->NoteSleep(on);
 }
 
 BodyChanges Region::TakeChanges() {
   Holdings& h = impl_->holdings;
-  h.engine->TakeSleepers(&h.changes.slept);
+  h.engine->TakeSleep(&h.changes.slept, &h.changes.woke);
   return std::exchange(h.changes, {});
 }
 

@@ -81,9 +81,15 @@ struct BodyChanges {
     Tick from = 0;            // the first state in which it is there
     Vec3 at = Vec3::Zero();   // where it was, m
   };
-  std::vector<BodyId> came;   // spawned or transferred here; may be gone again
-  std::vector<Gone> gone;     // in the order in which they went; may have come again
-  std::vector<BodyId> slept;  // fell asleep; may be awake again or gone
+  std::vector<BodyId> came;         // spawned or transferred here; may be gone again
+  std::vector<Gone> gone;           // in the order in which they went; may have come again
+  std::vector<BodyId> slept, woke;  // fell asleep, woke up; may have done the other since, or be gone
+};
+
+// What decides a region's future, after a tick.
+struct RegionSnapshot {
+  std::string state;           // Engine::Save of all bodies
+  std::vector<Input> to_come;  // inputs of clients that act after it
 };
 
 class Region {
@@ -117,6 +123,8 @@ class Region {
   // delay demands; nothing is known of the body until then. Sequences of one source must grow: one that does not has
   // been taken before, here or elsewhere, and acts only once. InvalidArgument names the field; then nothing changes.
   absl::Status Submit(const Input& input);
+  // Of what was submitted, that which waits for an exchange with room for it.
+  size_t inputs_waiting() const;
   // Since the last call: what became of what was submitted here, each time that it was.
   std::vector<InputOutcome> TakeOutcomes();
   // Since the last call: every client's input that takes effect, with its tick, in order of delivery; the same in all
@@ -128,6 +136,13 @@ class Region {
   void Observe(std::vector<BodyRecord>* out) const;
   // Sum over these bodies of a hash of (id, hash): add the regions' values to get the world's (I6).
   uint64_t StateHash() const;
+
+  // Together with those of the other regions after the same tick it is the state of the world. Preconditions: k = 0,
+  // and the phase is kBegin. Linear in the bodies.
+  RegionSnapshot Snapshot() const;
+
+  // At most so many of the boxes that peers hold of this region's bodies, each body once, in no order. Linear in them.
+  void AppendAuras(size_t most, std::vector<WireBox>* out) const;
 
   // From here on changes are noted; they cost memory until they are taken.
   void WatchChanges(bool on);

@@ -77,6 +77,14 @@ class SyncExchange final : public Protocol {
   }
 
   void ObserveInFlight(std::vector<BodyRecord>*) const override {}
+  void AppendAuras(size_t most, std::vector<WireBox>* out) const override {
+    absl::flat_hash_set<BodyId> seen;
+    for (const auto& [peer, told] : told_) {
+      for (const auto& [id, box] : told) {
+        if (seen.size() < most && seen.insert(id).second) out->push_back(box);
+      }
+    }
+  }
 
  private:
   struct Foreign {

@@ -198,13 +198,16 @@ class ToyEngine final : public Engine {
     return nearest;
   }
 
-  void NoteSleepers(bool on) override {
-    note_fallen_ = on;
-    fallen_.clear();
+  void NoteSleep(bool on) override {
+    note_sleep_ = on;
+    slept_.clear();
+    woke_.clear();
   }
-  void TakeSleepers(std::vector<BodyId>* out) override {
-    out->insert(out->end(), fallen_.begin(), fallen_.end());
-    fallen_.clear();
+  void TakeSleep(std::vector<BodyId>* slept, std::vector<BodyId>* woke) override {
+    slept->insert(slept->end(), slept_.begin(), slept_.end());
+    woke->insert(woke->end(), woke_.begin(), woke_.end());
+    slept_.clear();
+    woke_.clear();
   }
 
   uint64_t Hash(BodyId id) const override {
@@ -340,7 +343,10 @@ class ToyEngine final : public Engine {
   void SortJoints() {
     std::sort(joints_.begin(), joints_.end(), [](const Joint& x, const Joint& y) { return x.id < y.id; });
   }
-  static void Wake(Body& b) { b.asleep = b.slow = 0; }
+  void Wake(Body& b) {
+    if (note_sleep_ && b.asleep != 0) woke_.push_back(b.id);
+    b.asleep = b.slow = 0;
+  }
   void Clamp(Body& b) const {
     const double limit = environment_->speed_limit;
     if (limit <= 0) return;
@@ -388,7 +394,7 @@ class ToyEngine final : public Engine {
     }
   }
 
-  static bool CollidePair(Body& a, Body& b, double* memory) {
+  bool CollidePair(Body& a, Body& b, double* memory) {
     bool changed = false;
     if (a.asleep != b.asleep) {
       Wake(a);
@@ -433,15 +439,15 @@ class ToyEngine final : public Engine {
       b.slow = 0;
     } else if (++b.slow >= kSleepTicks) {
       b.asleep = 1;
-      if (note_fallen_) fallen_.push_back(b.id);
+      if (note_sleep_) slept_.push_back(b.id);
       std::fill(b.velocity, b.velocity + 3, 0.0);
     }
   }
 
   std::shared_ptr<const Environment> environment_;
   double floor_ = -1e300;
-  bool note_fallen_ = false;
-  std::vector<BodyId> fallen_;
+  bool note_sleep_ = false;
+  std::vector<BodyId> slept_, woke_;
   double max_radius_ = 0;
   std::vector<Body> bodies_;  // ascending by id
   std::vector<Joint> joints_;

@@ -64,8 +64,8 @@ class BulletEngine : public Engine {
   void AppendPoses(const Box& box, std::vector<BodyPose>* out) const override;
   int64_t CountAwake() const override { return static_cast<int64_t>(world_.awake().size()); }
   std::optional<RayHit> CastRay(const Vec3& from, const Vec3& to) const override;
-  void NoteSleepers(bool on) override { world_.NoteFallen(on); }
-  void TakeSleepers(std::vector<BodyId>* out) override { world_.TakeFallen(out); }
+  void NoteSleep(bool on) override { world_.NoteSleep(on); }
+  void TakeSleep(std::vector<BodyId>* slept, std::vector<BodyId>* woke) override { world_.TakeSleep(slept, woke); }
   double MaxRadius() const override { return world_.max_radius(); }
 
   std::string Save(std::span<const BodyId> ids) const override;

@@ -105,8 +105,7 @@ void BulletWorld::Flood(Body* seed) {
   for (Body* b : members_) {
     b->island = restless ? islands_ : -1;
     if (restless && b->asleep) {
-      b->asleep = false;
-      ForgetSleeper(b);
+      NoLongerAsleep(b);
       woken_.push_back(b);
     } else if (!restless && !b->asleep) {
       FallAsleep(b);
@@ -197,6 +196,7 @@ void BulletWorld::Integrate(std::span<Body*> bodies) {
   for (size_t i = 0; i < bodies.size(); ++i) {
     Body* b = bodies[i];
     b->rigid.setLinearVelocity(Clamped(b->rigid.getLinearVelocity()));
+    b->rigid.setAngularVelocity(ClampedSpin(b->rigid.getAngularVelocity()));
     b->rigid.predictIntegratedTransform(dt_, targets_[i]);
     if (!b->ccd || !MovesFast(*b, (b->rigid.getLinearVelocity() * dt_).length2())) continue;
     SweepHit hit;

@@ -31,6 +31,12 @@ btRigidBody::btRigidBodyConstructionInfo Construction(double mass, const Collisi
   return info;
 }
 
+// Not idempotent in the last bit, so it belongs where a velocity changes, not where a state is restored.
+btVector3 AtMost(double limit, const btVector3& v) {
+  const double length2 = v.length2();
+  return length2 > limit * limit ? v * (limit / std::sqrt(length2)) : v;
+}
+
 bool Outside(const Body& b, const Rect& rect, double margin) {
   return !rect.Encloses({FromBullet(b.low), FromBullet(b.high)}, margin);
 }
@@ -207,24 +213,32 @@ void BulletWorld::WakeNeighbours(Body* body) {
 void BulletWorld::Wake(Body* body) {
   body->still = 0;
   if (!body->asleep) return;
-  body->asleep = false;
-  ForgetSleeper(body);
+  NoLongerAsleep(body);
   awake_.push_back(body);
   awake_unsorted_ = true;
 }
 
-void BulletWorld::NoteFallen(bool on) {
-  note_fallen_ = on;
-  fallen_.clear();
+void BulletWorld::NoLongerAsleep(Body* body) {
+  if (note_sleep_) woke_.push_back(body->id);
+  body->asleep = false;
+  ForgetSleeper(body);
 }
 
-void BulletWorld::TakeFallen(std::vector<BodyId>* out) {
-  out->insert(out->end(), fallen_.begin(), fallen_.end());
-  fallen_.clear();
+void BulletWorld::NoteSleep(bool on) {
+  note_sleep_ = on;
+  slept_.clear();
+  woke_.clear();
+}
+
+void BulletWorld::TakeSleep(std::vector<BodyId>* slept, std::vector<BodyId>* woke) {
+  slept->insert(slept->end(), slept_.begin(), slept_.end());
+  woke->insert(woke->end(), woke_.begin(), woke_.end());
+  slept_.clear();
+  woke_.clear();
 }
 
 void BulletWorld::FallAsleep(Body* body) {
-  if (note_fallen_) fallen_.push_back(body->id);
+  if (note_sleep_) slept_.push_back(body->id);
   body->asleep = true;
   body->still = 0;
   body->rigid.setLinearVelocity(btVector3(0, 0, 0));
@@ -250,7 +264,7 @@ void BulletWorld::SetVelocities(Body* body, const btVector3& velocity, const btV
   Wake(body);
   ReleaseParted(body);
   body->rigid.setLinearVelocity(Clamped(velocity));
-  body->rigid.setAngularVelocity(angular_velocity);
+  body->rigid.setAngularVelocity(ClampedSpin(angular_velocity));
   if (!body->ccd) return;
   RefreshBox(body);
   max_radius_ = std::max(max_radius_, Radius(*body));
@@ -258,10 +272,12 @@ void BulletWorld::SetVelocities(Body* body, const btVector3& velocity, const btV
   broadphase_.Commit();
 }
 
-// Not idempotent in the last bit, so it belongs where a velocity changes, not where a state is restored.
 btVector3 BulletWorld::Clamped(const btVector3& velocity) const {
-  const double limit = environment_.speed_limit, speed2 = velocity.length2();
-  return limit > 0 && speed2 > limit * limit ? velocity * (limit / std::sqrt(speed2)) : velocity;
+  return AtMost(environment_.speed_limit > 0 ? std::min(environment_.speed_limit, kMostSpeed) : kMostSpeed, velocity);
+}
+
+btVector3 BulletWorld::ClampedSpin(const btVector3& angular_velocity) const {
+  return AtMost(kMostSpin, angular_velocity);
 }
 
 // The exact box: a function of pose, and of velocity for fast bodies with CCD only (their sweeps must stay inside it).

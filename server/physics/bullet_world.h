@@ -76,8 +76,8 @@ class BulletWorld {
   void SetVelocities(Body* body, const btVector3& velocity, const btVector3& angular_velocity);
 
   // From here on, bodies that fall asleep are noted; and those noted since the last call, appended.
-  void NoteFallen(bool on);
-  void TakeFallen(std::vector<BodyId>* out);
+  void NoteSleep(bool on);
+  void TakeSleep(std::vector<BodyId>* slept, std::vector<BodyId>* woke);
 
   void Step(Tick n);
   // Puts the kinematic bodies where they are after tick n. For a world without dynamic bodies.
@@ -93,8 +93,10 @@ class BulletWorld {
   void AddFixed(const BodySpec& spec, const std::shared_ptr<const CollisionShape>& shape);
   void ReleaseParted(Body* body);
   void RefreshBox(Body* body) const;
-  btVector3 Clamped(const btVector3& velocity) const;  // to the speed limit
+  btVector3 Clamped(const btVector3& velocity) const;  // to the speed limit, and kMostSpeed
+  btVector3 ClampedSpin(const btVector3& angular_velocity) const;
   void FallAsleep(Body* body);
+  void NoLongerAsleep(Body* body);
   void NoteSleeper(Body* body) const;
   void ForgetSleeper(Body* body) const;
   // bullet_step.cc
@@ -126,8 +128,8 @@ class BulletWorld {
   std::vector<Body*> awake_;  // all dynamic bodies that are not asleep; ascending ids unless awake_unsorted_
   bool awake_unsorted_ = false;
   double max_radius_ = 0;
-  bool note_fallen_ = false;
-  std::vector<BodyId> fallen_;
+  bool note_sleep_ = false;
+  std::vector<BodyId> slept_, woke_;
 
   // The rectangle that SleepersOutside was last asked for, and its answer.
   mutable Rect outside_of_;

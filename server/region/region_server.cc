@@ -20,6 +20,7 @@
 #include "server/region/hosted_region.h"
 #include "server/region/metrics.h"
 #include "server/transport/peer_service.h"
+#include "server/transport/recording_service.h"
 #include "server/transport/simulation_service.h"
 
 namespace aureole {
@@ -100,6 +101,7 @@ struct Process {
   std::unique_ptr<RegionMetrics> metrics;  // null: off
   PeerService peers;
   SimulationService simulation;
+  RecordingService recording;
   std::unique_ptr<GrpcServer> server;
   std::unique_ptr<ControlStream> control;
   std::unique_ptr<HostedRegion> hosted;
@@ -115,12 +117,16 @@ TickLoop::Hooks Process::Hooks() {
   };
   hooks.inputs = [this] { return simulation.inputs().Take(); };
   hooks.outcomes = [this](const std::vector<InputOutcome>& outcomes) { simulation.inputs().Settle(outcomes); };
-  hooks.publish = [this](Region* region, int64_t bodies) { simulation.AfterTick(region, bodies); };
+  hooks.publish = [this](Region* region, int64_t bodies, const std::vector<Input>& delivered) {
+    simulation.AfterTick(region, bodies);
+    recording.AfterTick(*region, delivered);
+  };
   hooks.report = [this](const v1::Report& report) {
     if (metrics != nullptr) {
       metrics->Update(report);
       metrics->UpdateRefusedLinks(hosted->links().Totals().refused_hellos + peers.refused());
     }
+    simulation.Report(report);
     if (report.finished()) spdlog::info("finished at tick {}", report.tick());
     v1::FromRegion message;
     *message.mutable_report() = report;
@@ -150,6 +156,7 @@ absl::Status Process::Handle(const v1::ToRegion& message) {
   } else if (message.has_start()) {
     if (hosted == nullptr) return absl::FailedPreconditionError("a start without an assignment");
     simulation.Serve(hosted->assignment(), hosted->world());
+    recording.Serve(hosted->assignment().region(), hosted->assignment().world(), hosted->world().exchange.k == 0);
     hosted->Start(message.start().start_unix_us(), Hooks());
     server->SetServing(true);
   }
@@ -204,7 +211,7 @@ int RunRegionServer(const RegionServerOptions& options) {
     }
     process.metrics = *std::move(metrics);
   }
-  process.server = GrpcServer::Listen(options.listen, {&process.peers, &process.simulation});
+  process.server = GrpcServer::Listen(options.listen, {&process.peers, &process.simulation, &process.recording});
   if (process.server == nullptr) {
     spdlog::error("--listen: cannot listen on {}; choose another host:port, or port 0", options.listen);
     return 1;
@@ -227,6 +234,7 @@ int RunRegionServer(const RegionServerOptions& options) {
   alarm(kLongestLeaveSeconds);
   process.server->SetServing(false);
   process.simulation.Stop();
+  process.recording.Stop();
   if (process.hosted != nullptr) {
     process.hosted->Stop();
     // Peers may still need the last frames.

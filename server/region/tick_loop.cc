@@ -83,6 +83,7 @@ bool TickLoop::RunTick() {
 }
 
 void TickLoop::OfferInputs() {
+  if (region_->inputs_waiting() > 0) return;
   for (const Input& input : hooks_.inputs()) {
     if (absl::Status s = region_->Submit(input); !s.ok()) {
       hooks_.log(
@@ -169,7 +170,6 @@ void TickLoop::AfterTick() {
   if (const std::vector<InputOutcome> outcomes = region_->TakeOutcomes(); !outcomes.empty()) {
     hooks_.outcomes(outcomes);
   }
-  region_->TakeDelivered();  // nobody records them yet
   for (const Violation& v : region_->TakeViolations()) {
     hooks_.log(absl::StrCat("violation at tick ", v.tick, ": body ", v.own, " of this region and body ", v.foreign,
                             " were stepped apart although they touch, ", v.depth, " m deep at ", v.speed, " m/s"));
@@ -180,7 +180,7 @@ void TickLoop::AfterTick() {
     out->set_depth(v.depth);
     out->set_speed(v.speed);
   }
-  hooks_.publish(region_, bodies);
+  hooks_.publish(region_, bodies, region_->TakeDelivered());
 }
 
 void TickLoop::Report(const std::vector<RegionId>& waiting_for, bool finished) {

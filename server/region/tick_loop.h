@@ -27,10 +27,11 @@ class TickLoop {
   };
   // All called on the tick thread.
   struct Hooks {
-    std::function<std::vector<Input>()> inputs;  // before each tick: what clients offer
+    std::function<std::vector<Input>()> inputs;  // before a tick whose exchange has room: what clients offer
     std::function<void(const std::vector<InputOutcome>&)> outcomes;
     std::function<void(const FrameSample&)> after_tick;
-    std::function<void(Region*, int64_t bodies)> publish;  // after each tick
+    // After each tick, with the clients' inputs that were delivered in it.
+    std::function<void(Region*, int64_t bodies, const std::vector<Input>& delivered)> publish;
     std::function<void(const v1::Report&)> report;
     std::function<void(const std::string&)> log;  // waits over 1 s, violations, refused frames
   };

@@ -2,6 +2,7 @@
 // in the cell of its centre of mass. Cells are what views select and what is encoded once for all who see it.
 #pragma once
 
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <memory>
@@ -23,9 +24,13 @@ struct CellKey {
   }
 };
 
+// Steps of kFineQuanta from the origin to any cell fit 32 bits: 1,048,576 m. What is further out is in the outermost.
+inline constexpr int32_t kLastCell = 32767;
 inline CellKey CellOf(const Vec3& position) {
-  return {static_cast<int32_t>(std::floor(position.x() / kCellSize)),
-          static_cast<int32_t>(std::floor(position.z() / kCellSize))};
+  const auto index = [](double metres) {
+    return static_cast<int32_t>(std::clamp(std::floor(metres / kCellSize), -kLastCell - 1.0, double{kLastCell}));
+  };
+  return {index(position.x()), index(position.z())};
 }
 
 enum class Precision : uint8_t { kFine = 0, kCoarse = 1, kExact = 2 };

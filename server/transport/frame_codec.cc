@@ -86,7 +86,7 @@ void EncodeGraph(const Graph& g, v1::Frame::Graph* out) {
   }
   for (RegionId r : g.opened) out->add_opened(static_cast<uint32_t>(r));
   for (RegionId r : g.closed) out->add_closed(static_cast<uint32_t>(r));
-  for (const Input& i : g.inputs) EncodeInput(i, out->add_input());
+  EncodeInputs(g.inputs, out->mutable_input());
   for (const AppliedInput& a : g.applied) {
     out->add_applied_source(a.name.first);
     out->add_applied_sequence(a.name.second);
@@ -270,11 +270,8 @@ absl::Status DecodeGraph(const v1::Frame::Graph& in, Graph* out) {
   AUREOLE_RETURN_IF_ERROR(DecodeRegions("graph.opened", in.opened(), &out->opened));
   AUREOLE_RETURN_IF_ERROR(DecodeRegions("graph.closed", in.closed(), &out->closed));
   AUREOLE_RETURN_IF_ERROR(CheckCount("graph.input", in.input_size(), kMaxInputs));
-  out->inputs.resize(in.input_size());
-  for (int i = 0; i < in.input_size(); ++i) {
-    if (absl::Status s = DecodeInput(in.input(i), &out->inputs[i]); !s.ok()) {
-      return absl::InvalidArgumentError(absl::StrCat("frame.graph.", std::string(s.message())));
-    }
+  if (absl::Status s = DecodeInputs(in.input(), &out->inputs); !s.ok()) {
+    return absl::InvalidArgumentError(absl::StrCat("frame.graph.", std::string(s.message())));
   }
   AUREOLE_RETURN_IF_ERROR(CheckCount("graph.applied_source", in.applied_source_size(), kMaxApplied));
   AUREOLE_RETURN_IF_ERROR(

@@ -98,8 +98,9 @@ absl::Status Decode(const v1::SolidShape& in, bool child, Shape* out) {
   return absl::OkStatus();
 }
 
-void Encode(const BodySpec& body, v1::NewBody* out) {
-  Encode(*body.shape, out->mutable_shape());
+// `last`: the shape of the spawn before, when it is not to be told again.
+void Encode(const BodySpec& body, const Shape* last, v1::NewBody* out) {
+  if (body.shape.get() != last) Encode(*body.shape, out->mutable_shape());
   out->set_mass(body.mass);
   Encode(body.position, out->mutable_position());
   Encode(body.orientation, out->mutable_orientation());
@@ -114,10 +115,13 @@ void Encode(const BodySpec& body, v1::NewBody* out) {
   out->set_asleep(body.asleep);
 }
 
-absl::Status Decode(const v1::NewBody& in, BodySpec* out) {
-  auto shape = std::make_shared<Shape>();
-  AUREOLE_RETURN_IF_ERROR(Decode(in.shape(), false, shape.get()));
-  out->shape = std::move(shape);
+absl::Status Decode(const v1::NewBody& in, const std::shared_ptr<const Shape>& last, BodySpec* out) {
+  out->shape = last;
+  if (in.has_shape() || last == nullptr) {
+    auto shape = std::make_shared<Shape>();
+    AUREOLE_RETURN_IF_ERROR(Decode(in.shape(), false, shape.get()));
+    out->shape = std::move(shape);
+  }
   out->mass = in.mass();
   if (!(out->mass >= limits::kMass.min && out->mass <= limits::kMass.max)) {
     return Bad("spawn.mass", absl::StrCat(out->mass, " kg"));
@@ -154,13 +158,11 @@ bool HasUnknownFields(const google::protobuf::Message& message) {
   return false;
 }
 
-}  // namespace
-
-void EncodeInput(const Input& input, v1::Input* out) {
+void Encode(const Input& input, const Shape* last, v1::Input* out) {
   out->set_source(input.source);
   out->set_sequence(input.sequence);
   out->set_kind(static_cast<uint32_t>(input.kind));
-  if (input.kind == Input::Kind::kSpawn) return Encode(*input.spawn, out->mutable_spawn());
+  if (input.kind == Input::Kind::kSpawn) return Encode(*input.spawn, last, out->mutable_spawn());
   out->set_body(input.body);
   Encode(input.linear, out->mutable_linear());
   Encode(input.angular, out->mutable_angular());
@@ -174,7 +176,7 @@ void EncodeInput(const Input& input, v1::Input* out) {
   out->mutable_area()->set_fades(input.area.fades);
 }
 
-absl::Status DecodeInput(const v1::Input& in, Input* out) {
+absl::Status Decode(const v1::Input& in, const std::shared_ptr<const Shape>& last, Input* out) {
   if (HasUnknownFields(in)) return absl::InvalidArgumentError("input: has fields that this version does not know");
   if (in.kind() > static_cast<uint32_t>(Input::Kind::kVelocityChange)) return Bad("kind", "no such kind");
   out->source = in.source();
@@ -182,7 +184,7 @@ absl::Status DecodeInput(const v1::Input& in, Input* out) {
   out->kind = static_cast<Input::Kind>(in.kind());
   if (out->kind == Input::Kind::kSpawn) {
     auto body = std::make_shared<BodySpec>();
-    AUREOLE_RETURN_IF_ERROR(Decode(in.spawn(), body.get()));
+    AUREOLE_RETURN_IF_ERROR(Decode(in.spawn(), last, body.get()));
     out->spawn = std::move(body);
   } else {
     out->body = in.body();
@@ -202,14 +204,34 @@ absl::Status DecodeInput(const v1::Input& in, Input* out) {
   return CheckLiveInput(*out);
 }
 
+}  // namespace
+
+void EncodeInputs(const std::vector<Input>& inputs, google::protobuf::RepeatedPtrField<v1::Input>* out) {
+  const Shape* last = nullptr;
+  for (const Input& input : inputs) {
+    Encode(input, last, out->Add());
+    if (input.spawn != nullptr) last = input.spawn->shape.get();
+  }
+}
+
+absl::Status DecodeInputs(const google::protobuf::RepeatedPtrField<v1::Input>& in, std::vector<Input>* out) {
+  std::shared_ptr<const Shape> last;
+  out->clear();
+  for (const v1::Input& input : in) {
+    AUREOLE_RETURN_IF_ERROR(Decode(input, last, &out->emplace_back()));
+    if (out->back().spawn != nullptr) last = out->back().spawn->shape;
+  }
+  return absl::OkStatus();
+}
+
 void RecordInput(const Input& input, v1::Input* out) {
-  EncodeInput(input, out);
+  Encode(input, nullptr, out);
   out->set_tick(input.tick);
   out->set_body(input.body);
 }
 
 absl::Status ReadRecordedInput(const v1::Input& in, Input* out) {
-  AUREOLE_RETURN_IF_ERROR(DecodeInput(in, out));
+  AUREOLE_RETURN_IF_ERROR(Decode(in, nullptr, out));
   if (in.tick() < 1) return Bad("tick", "must be at least 1");
   out->tick = in.tick();
   if (out->kind != Input::Kind::kSpawn) return absl::OkStatus();

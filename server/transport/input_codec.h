@@ -1,6 +1,8 @@
 // Inputs of clients to protobuf and back (proto/aureole/v1/input.proto). Lossless: every bit of a number survives.
 #pragma once
 
+#include <vector>
+
 #include <absl/status/status.h>
 
 #include "aureole/v1/input.pb.h"
@@ -8,11 +10,12 @@
 
 namespace aureole {
 
-// Does not write the tick, nor the id of a spawned body: those that are told of it find them out.
-void EncodeInput(const Input& input, v1::Input* out);
+// Does not write the tick, nor the id of a spawned body: those that are told of it find them out. Bodies that share a
+// shape are told it once, those that follow each other in the list.
+void EncodeInputs(const std::vector<Input>& inputs, google::protobuf::RepeatedPtrField<v1::Input>* out);
 
-// InvalidArgument names the field when it is not an input that a client can have given and EncodeInput have written.
-absl::Status DecodeInput(const v1::Input& in, Input* out);
+// InvalidArgument names the field when it is no list that clients can have given and EncodeInputs have written.
+absl::Status DecodeInputs(const google::protobuf::RepeatedPtrField<v1::Input>& in, std::vector<Input>* out);
 
 // With its tick and the id of a spawned body, for recordings.
 void RecordInput(const Input& input, v1::Input* out);

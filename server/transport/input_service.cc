@@ -11,32 +11,20 @@
 namespace aureole {
 namespace {
 
-constexpr size_t kMostAllowances = 4096;  // of clients, kept between their calls
+constexpr size_t kMostAllowances = 1 << 16;  // of clients, kept between their calls
 
-v1::WorldSpec NamesOf(const v1::WorldSpec& spec) {
-  v1::WorldSpec out;
-  *out.mutable_materials() = spec.materials();
-  *out.mutable_shapes() = spec.shapes();
-  return out;
-}
-
-int64_t Copies(const v1::Array& a) {
-  const auto along = [](int64_t n) { return std::clamp<int64_t>(n, 1, InputService::kMostPerMessage + 1); };
-  return along(a.x()) * along(a.y()) * along(a.z());
-}
-
-void CheckNames(uint64_t client, uint64_t sequence, int64_t inputs, SpecCheck* check) {
-  if (client == 0) check->Fail(Path() / "client", "must be given, and not be 0", v1::MISSING);
-  if (sequence == 0) check->Fail(Path() / "sequence", "must be at least 1", v1::MISSING);
-  if (sequence > ~uint64_t{0} - static_cast<uint64_t>(inputs)) {
-    check->Fail(Path() / "sequence", "must leave room for those of all bodies");
-  }
+grpc::Status TooMany(double rate) {
+  return Refusal(
+      grpc::StatusCode::RESOURCE_EXHAUSTED, v1::RATE_LIMIT, "",
+      absl::StrCat("the world allows a client ", rate,
+                   " inputs per second, and the server has room for some of all clients; send fewer, later"));
 }
 
 }  // namespace
 
 v1::Reason ReasonOf(const InputOutcome& outcome) {
   if (outcome.applied()) return v1::REASON_UNSPECIFIED;
+  if (outcome.full) return v1::WORLD_FULL;
   return outcome.tick == 0 ? v1::FORGOTTEN : v1::NO_SUCH_BODY;
 }
 
@@ -106,18 +94,19 @@ class InputService::ImpulseStream final : public Call<grpc::ServerReadReactor<v1
   }
 
   void OnReadDone(bool ok) override {
+    ImpulseInputs read;
+    const std::shared_ptr<const InputScene> scene = service_->scene();
+    if (ok && scene != nullptr) read = ReadBatch(*scene, (Path() / "batch")[batches_++], batch_, client_);
     const std::lock_guard lock(service_->mutex_);
     reading_ = false;
     if (ended_) return;
-    if (!ok) {
-      all_read_ = true;
-    } else {
-      size_t taken = 0;
-      const grpc::Status refusal = service_->OfferLocked(this, (Path() / "batch")[batches_], batch_, &client_, &taken);
-      waiting_ += taken;
-      if (!refusal.ok()) return End(refusal);
+    if (ok) {
+      if (service_->scene_ == nullptr) return End(RegionGivenUp());
+      client_ = read.client;
+      waiting_ += service_->Offer(this, std::move(read.inputs));
+      if (!read.refusal.ok()) return End(read.refusal);
     }
-    ++batches_;
+    all_read_ = !ok;
     Continue();
   }
 
@@ -130,9 +119,9 @@ class InputService::ImpulseStream final : public Call<grpc::ServerReadReactor<v1
 
   v1::ImpulseSummary* const summary_;
   v1::ImpulseBatch batch_;
-  uint64_t client_ = 0;
-  int batches_ = 0;
-  size_t waiting_ = 0;  // outcomes
+  uint64_t client_ = 0;  // of reads only
+  int batches_ = 0;      // likewise
+  size_t waiting_ = 0;   // outcomes
   bool reading_ = false, all_read_ = false;
 };
 
@@ -141,14 +130,9 @@ class InputService::BodiesCall : public Call<grpc::ServerUnaryReactor> {
  public:
   using Call::Call;
 
-  // `inputs`: one per body, with their sources, sequences growing by one.
+  // `inputs`: one per body, with their sources, sequences growing by one; they have been allowed.
   void Offer(std::vector<Input> inputs) {
-    if (inputs.empty()) return End(grpc::Status::OK);
-    if (!service_->Allow(inputs[0].source, static_cast<double>(inputs.size()))) {
-      return End(Refusal(grpc::StatusCode::RESOURCE_EXHAUSTED, v1::RATE_LIMIT, "",
-                         absl::StrCat("the world allows a client ", service_->scene_->limits.rate,
-                                      " inputs per second; send fewer, later")));
-    }
+    if (!service_->HasRoom(inputs.back())) return End(TooMany(service_->scene_->limits.rate));
     waiting_ = inputs.size();
     for (Input& i : inputs) service_->Submit(this, std::move(i));
   }
@@ -205,12 +189,6 @@ class InputService::RemoveCall final : public BodiesCall {
   v1::RemoveBodiesResponse* const response_;
 };
 
-InputService::Scene::Scene(const v1::WorldSpec& spec, int64_t tick)
-    : tick_us(tick),
-      names(NamesOf(spec)),
-      reader(names, &check),
-      limits(ReadClientLimits(spec.client_limits(), &check)) {}
-
 grpc::ServerReadReactor<v1::ImpulseBatch>* InputService::ApplyImpulses(v1::ImpulseSummary* summary) {
   const std::lock_guard lock(mutex_);
   auto* stream = new ImpulseStream(this, summary);
@@ -225,71 +203,43 @@ grpc::ServerReadReactor<v1::ImpulseBatch>* InputService::ApplyImpulses(v1::Impul
 
 grpc::ServerUnaryReactor* InputService::SpawnBodies(const v1::SpawnBodiesRequest& request,
                                                     v1::SpawnBodiesResponse* response) {
-  const std::lock_guard lock(mutex_);
-  auto* call = new SpawnCall(this, request.sequence(), response);
-  callers_.insert(call);
-  if (scene_ == nullptr) {
-    call->End(NoRegion());
-    return call;
-  }
-  SpecCheck& check = scene_->check = SpecCheck();
-  int64_t copies = 0;
-  for (const v1::Body& b : request.bodies()) copies += Copies(b.array());
-  CheckNames(request.client(), request.sequence(), copies, &check);
-  const Path path = Path() / "bodies";
-  if (request.bodies_size() == 0) check.Fail(path, "must be at least one", v1::MISSING);
-  if (copies > kMostPerMessage)
-    check.Fail(path, "must be at most 1024 with their copies; send more calls", v1::TOO_MANY);
-  std::vector<BodySpec> bodies;
-  for (int i = 0; i < request.bodies_size() && check.ok(); ++i) {
-    if (request.bodies(i).id() != 0) {
-      check.Fail(path[i] / "id", "must not be given: the servers give it, and the answer names it", v1::CONFLICT);
-    }
-    scene_->reader.Dynamic(path[i], request.bodies(i), &bodies);
-  }
-  if (!check.ok()) {
-    call->End(Refusal(check));
-    return call;
-  }
-  std::vector<Input> inputs(bodies.size());
-  for (size_t i = 0; i < bodies.size(); ++i) {
-    bodies[i].id = 0;
-    inputs[i].kind = Input::Kind::kSpawn;
-    inputs[i].source = request.client();
-    inputs[i].sequence = request.sequence() + i;
-    inputs[i].spawn = std::make_shared<const BodySpec>(std::move(bodies[i]));
-  }
-  call->Offer(std::move(inputs));
-  return call;
+  return Start(new SpawnCall(this, request.sequence(), response), request, &ReadSpawns);
 }
 
 grpc::ServerUnaryReactor* InputService::RemoveBodies(const v1::RemoveBodiesRequest& request,
                                                      v1::RemoveBodiesResponse* response) {
+  return Start(new RemoveCall(this, response), request, &ReadRemovals);
+}
+
+// Reads what a call is about in two steps, so that a client that sends too much costs little: how much it is, and what.
+template <class Request>
+grpc::ServerUnaryReactor* InputService::Start(BodiesCall* call, const Request& request, Reader<Request> read) {
+  std::shared_ptr<const InputScene> scene;
+  SpecCheck check;
+  double cost = 0;
+  {
+    const std::lock_guard lock(mutex_);
+    callers_.insert(call);
+    scene = scene_;
+    if (scene == nullptr) {
+      call->End(NoRegion());
+      return call;
+    }
+    cost = CostOf(request, &check);
+    if (check.ok() && !IsRepeat(request.client(), request.sequence()) && !Allow(request.client(), cost)) {
+      call->End(TooMany(scene->limits.rate));
+      return call;
+    }
+  }
+  std::vector<Input> inputs;
+  if (check.ok()) inputs = read(*scene, request, &check);
   const std::lock_guard lock(mutex_);
-  auto* call = new RemoveCall(this, response);
-  callers_.insert(call);
-  if (scene_ == nullptr) {
-    call->End(NoRegion());
-    return call;
-  }
-  SpecCheck& check = scene_->check = SpecCheck();
-  CheckNames(request.client(), request.sequence(), request.body_size(), &check);
-  const Path path = Path() / "body";
-  if (request.body_size() == 0) check.Fail(path, "must be at least one", v1::MISSING);
-  if (request.body_size() > kMostPerMessage) check.Fail(path, "must be at most 1024; send more calls", v1::TOO_MANY);
-  std::vector<Input> inputs(static_cast<size_t>(request.body_size()));
-  for (int i = 0; i < request.body_size() && check.ok(); ++i) {
-    if (request.body(i) == 0) check.Fail(path[i], "must not be 0");
-    Input& input = inputs[static_cast<size_t>(i)];
-    input.kind = Input::Kind::kRemove;
-    input.source = request.client();
-    input.sequence = request.sequence() + static_cast<uint64_t>(i);
-    input.body = request.body(i);
-  }
-  if (check.ok()) {
-    call->Offer(std::move(inputs));
-  } else {
+  if (!check.ok()) {
     call->End(Refusal(check));
+  } else if (scene_ == nullptr) {
+    call->End(RegionGivenUp());
+  } else {
+    call->Offer(std::move(inputs));
   }
   return call;
 }
@@ -308,40 +258,41 @@ void InputService::Leave(InputCaller* caller) {
 
 grpc::Status InputService::Offer(InputCaller* caller, const Path& path, const v1::ImpulseBatch& batch, uint64_t* client,
                                  size_t* taken) {
+  const std::shared_ptr<const InputScene> now = scene();
+  if (now == nullptr) return RegionGivenUp();
+  ImpulseInputs read = ReadBatch(*now, path, batch, *client);
+  *client = read.client;
   const std::lock_guard lock(mutex_);
   if (scene_ == nullptr) return RegionGivenUp();
-  return OfferLocked(caller, path, batch, client, taken);
+  *taken = Offer(caller, std::move(read.inputs));
+  return read.refusal;
 }
 
-grpc::Status InputService::OfferLocked(InputCaller* caller, const Path& path, const v1::ImpulseBatch& batch,
-                                       uint64_t* client, size_t* taken) {
-  SpecCheck& check = scene_->check = SpecCheck();
-  if (*client == 0) *client = batch.client();
-  if (*client == 0) check.Fail(path / "client", "must be given in the first batch, and not be 0", v1::MISSING);
-  if (batch.client() != 0 && batch.client() != *client) {
-    check.Fail(path / "client", "must not change within a stream", v1::CONFLICT);
-  }
-  if (batch.impulse_size() > kMostPerMessage) {
-    check.Fail(path / "impulse", "must be at most 1024 in a batch; send more batches", v1::TOO_MANY);
-  }
-  for (int i = 0; i < batch.impulse_size() && check.ok(); ++i) {
-    Input input = ReadImpulse((path / "impulse")[i], batch.impulse(i), scene_->tick_us, &check);
-    if (!check.ok()) break;
-    input.source = *client;
+std::shared_ptr<const InputScene> InputService::scene() {
+  const std::lock_guard lock(mutex_);
+  return scene_;
+}
+
+// Returns how many were taken; the others are rejected.
+size_t InputService::Offer(InputCaller* caller, std::vector<Input> inputs) {
+  size_t taken = 0;
+  for (Input& input : inputs) {
     const bool within = IsWithin(scene_->limits, input);
-    if (!within || !Allow(*client, static_cast<double>(input.ticks))) {
+    const double cost = static_cast<double>(CostOf(input)) * static_cast<double>(input.ticks);
+    const bool allowed = IsRepeat(input.source, input.sequence) || Allow(input.source, cost);
+    if (!within || !allowed || !HasRoom(input)) {
       caller->Reject(within ? v1::RATE_LIMIT : v1::TOO_STRONG, input.sequence);
       continue;
     }
     Submit(caller, std::move(input));
-    ++*taken;
+    ++taken;
   }
-  return check.ok() ? grpc::Status::OK : Refusal(check);
+  return taken;
 }
 
 void InputService::Serve(const v1::WorldSpec& spec, int64_t tick_us) {
   const std::lock_guard lock(mutex_);
-  scene_ = std::make_unique<Scene>(spec, tick_us);
+  scene_ = std::make_shared<const InputScene>(spec, tick_us);
 }
 
 void InputService::Stop() {
@@ -352,7 +303,17 @@ void InputService::Stop() {
 
 std::vector<Input> InputService::Take() {
   const std::lock_guard lock(mutex_);
-  return std::exchange(queue_, {});
+  std::vector<Input> out;
+  int cost = 0;
+  while (!queue_.empty() && cost < LiveInputs::kMostPerTick) {
+    Queued& next = queue_.front();
+    cost += CostOf(next.input);
+    queued_ -= CostOf(next.input);
+    queued_bytes_ -= next.bytes;
+    out.push_back(std::move(next.input));
+    queue_.pop_front();
+  }
+  return out;
 }
 
 void InputService::Settle(const std::vector<InputOutcome>& outcomes) {
@@ -366,10 +327,18 @@ void InputService::Settle(const std::vector<InputOutcome>& outcomes) {
   }
 }
 
+// It was taken before. It is not charged: refused now, it might have acted all the same.
+bool InputService::IsRepeat(uint64_t client, uint64_t sequence) const {
+  const auto it = allowances_.find(client);
+  return it != allowances_.end() && sequence <= it->second.sequence;
+}
+
 bool InputService::Allow(uint64_t client, double inputs) {
   const double rate = scene_->limits.rate;
   const Clock::time_point now = Clock::now();
   if (allowances_.size() >= kMostAllowances && !allowances_.contains(client)) {
+    if (now - purged_at_ < std::chrono::seconds(1)) return false;
+    purged_at_ = now;
     // Those of clients that were silent for a second are full again, as are those of new ones.
     absl::erase_if(allowances_, [now](const auto& e) { return now - e.second.at > std::chrono::seconds(1); });
   }
@@ -383,9 +352,18 @@ bool InputService::Allow(uint64_t client, double inputs) {
   return true;
 }
 
+bool InputService::HasRoom(const Input& input) const {
+  return queued_ + CostOf(input) <= kMostQueued && queued_bytes_ <= kMostQueuedBytes;
+}
+
 void InputService::Submit(InputCaller* caller, Input input) {
   waiting_.emplace(InputName{input.source, input.sequence}, caller);
-  queue_.push_back(std::move(input));
+  uint64_t& greatest = allowances_[input.source].sequence;
+  greatest = std::max(greatest, input.sequence);
+  const auto bytes = static_cast<int64_t>(BytesOf(input, queue_.empty() ? nullptr : &queue_.back().input));
+  queued_ += CostOf(input);
+  queued_bytes_ += bytes;
+  queue_.push_back({std::move(input), bytes});
 }
 
 void InputService::Remove(InputCaller* caller) {

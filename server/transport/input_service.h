@@ -5,6 +5,7 @@
 
 #include <chrono>
 #include <cstdint>
+#include <deque>
 #include <map>
 #include <memory>
 #include <mutex>
@@ -16,8 +17,7 @@
 
 #include "aureole/v1/simulation.grpc.pb.h"
 #include "server/core/live_inputs.h"
-#include "server/transport/input_reader.h"
-#include "server/transport/world_bodies.h"
+#include "server/transport/input_messages.h"
 
 namespace aureole {
 
@@ -35,8 +35,8 @@ class InputService {
  public:
   // Outcomes that one stream may wait for.
   static constexpr size_t kMostWaiting = 4096;
-  // Inputs in one message, copies of bodies included.
-  static constexpr int kMostPerMessage = 1024;
+  // What may wait for the tick thread, of all clients: by CostOf, and bytes.
+  static constexpr int64_t kMostQueued = 1 << 16, kMostQueuedBytes = 16 << 20;
 
   // From any thread; the calls of clients.
   grpc::ServerReadReactor<v1::ImpulseBatch>* ApplyImpulses(v1::ImpulseSummary* summary);
@@ -57,7 +57,8 @@ class InputService {
   // Ends all calls.
   void Stop();
 
-  // From the tick thread: what came since the last call, in order; and what became of it.
+  // From the tick thread: the next ones of what came, in order, about as many as it tells in a tick; and what became of
+  // them.
   std::vector<Input> Take();
   void Settle(const std::vector<InputOutcome>& outcomes);
 
@@ -71,35 +72,40 @@ class InputService {
   class SpawnCall;
   class RemoveCall;
 
-  // What reads bodies of this world.
-  struct Scene {
-    Scene(const v1::WorldSpec& spec, int64_t tick);
-    const int64_t tick_us;
-    v1::WorldSpec names;  // the named shapes and materials only
-    SpecCheck check;      // of the message that is being read
-    BodyReader reader;
-    ClientLimits limits;
-  };
   // What a client may still send; refills with time.
   struct Allowance {
     double left = 0;
     Clock::time_point at;
+    uint64_t sequence = 0;  // the greatest that was taken
   };
+  struct Queued {
+    Input input;
+    int64_t bytes = 0;
+  };
+  template <class Request>
+  using Reader = std::vector<Input> (*)(const InputScene& scene, const Request& request, SpecCheck* check);
+
+  template <class Request>
+  grpc::ServerUnaryReactor* Start(BodiesCall* call, const Request& request, Reader<Request> read);
+  std::shared_ptr<const InputScene> scene();
 
   // All hold the mutex.
-  grpc::Status OfferLocked(InputCaller* caller, const Path& path, const v1::ImpulseBatch& batch, uint64_t* client,
-                           size_t* taken);
+  size_t Offer(InputCaller* caller, std::vector<Input> inputs);
+  bool IsRepeat(uint64_t client, uint64_t sequence) const;
   bool Allow(uint64_t client, double inputs);
+  bool HasRoom(const Input& input) const;
   void Submit(InputCaller* caller, Input input);
   void Remove(InputCaller* caller);
 
   std::mutex mutex_;
-  std::unique_ptr<Scene> scene_;  // null: not serving
+  std::shared_ptr<const InputScene> scene_;  // null: not serving
   std::set<InputCaller*> callers_;
-  std::vector<Input> queue_;
+  std::deque<Queued> queue_;
+  int64_t queued_ = 0, queued_bytes_ = 0;
   // By input, the calls that wait for it; more than one when it was repeated.
   std::multimap<InputName, InputCaller*> waiting_;
   absl::flat_hash_map<uint64_t, Allowance> allowances_;
+  Clock::time_point purged_at_;  // of those that are full again
 };
 
 // Why it did not act; unspecified when it did.

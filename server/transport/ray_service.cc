@@ -12,13 +12,11 @@ namespace {
 
 constexpr limits::Range kLength{0, 1e5, "m"};
 
-struct Ray {
-  Vec3 from = Vec3::Zero(), to = Vec3::Zero();
-};
+}  // namespace
 
-std::vector<Ray> ReadRays(const v1::CastRaysRequest& request, SpecCheck* check) {
+std::vector<ClientRay> ReadRays(const v1::CastRaysRequest& request, SpecCheck* check) {
   const Path path = Path() / "rays";
-  std::vector<Ray> out;
+  std::vector<ClientRay> out;
   if (request.rays_size() == 0) check->Fail(path, "must be at least one", v1::MISSING);
   if (request.rays_size() > RayService::kMostPerCall) {
     check->Fail(path, "must be at most 256; send more calls", v1::TOO_MANY);
@@ -32,19 +30,17 @@ std::vector<Ray> ReadRays(const v1::CastRaysRequest& request, SpecCheck* check) 
   return out;
 }
 
-}  // namespace
-
 // One call. Guarded by the service's mutex; deletes itself.
 class RayService::Call final : public grpc::ServerUnaryReactor {
  public:
-  Call(RayService* service, std::vector<Ray> rays, v1::CastRaysResponse* response)
+  Call(RayService* service, std::vector<ClientRay> rays, v1::CastRaysResponse* response)
       : service_(service), rays_(std::move(rays)), response_(response) {}
 
   size_t rays() const { return rays_.size(); }
 
   void Answer(const Region& region) {
     response_->set_tick(region.tick());
-    for (const Ray& ray : rays_) {
+    for (const ClientRay& ray : rays_) {
       v1::CastRaysResponse::Hit* out = response_->add_hits();
       const std::optional<RayHit> hit = region.engine().CastRay(ray.from, ray.to);
       if (!hit.has_value()) continue;
@@ -71,7 +67,7 @@ class RayService::Call final : public grpc::ServerUnaryReactor {
 
  private:
   RayService* const service_;
-  const std::vector<Ray> rays_;
+  const std::vector<ClientRay> rays_;
   v1::CastRaysResponse* const response_;
   bool ended_ = false;
 };

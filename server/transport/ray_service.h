@@ -6,14 +6,21 @@
 #include <cstdint>
 #include <deque>
 #include <mutex>
-#include <set>
+#include <vector>
 
 #include <grpcpp/server_context.h>
 
 #include "aureole/v1/simulation.pb.h"
 #include "server/core/region.h"
+#include "server/transport/spec_check.h"
 
 namespace aureole {
+
+struct ClientRay {
+  Vec3 from = Vec3::Zero(), to = Vec3::Zero();
+};
+// A mistake is told to `check`.
+std::vector<ClientRay> ReadRays(const v1::CastRaysRequest& request, SpecCheck* check);
 
 class RayService {
  public:

@@ -90,7 +90,9 @@ void ReplicaCapture::Take(Region* region, std::shared_ptr<const Watch> watch, Ca
       out->fresh.push_back({id, region->EpochOf(id), engine.Look(id)});
     }
   }
-  // What was watched and is so no more, but still here: asleep, or elsewhere.
+  // What was watched and is so no more, but still here: asleep, or elsewhere. One that slept may have left at once.
+  last_.insert(last_.end(), changes.woke.begin(), changes.woke.end());
+  SortUnique(&last_);
   std::vector<BodyId> before;
   std::set_difference(last_.begin(), last_.end(), now.begin(), now.end(), std::back_inserter(before));
   for (BodyId id : before) {
@@ -120,8 +122,9 @@ void ReplicaCapture::TakeCells(const Engine& engine, const std::vector<CellKey>&
                                std::vector<BodyPose>* out) const {
   for (const CellKey& c : cells) {
     const auto first = static_cast<std::ptrdiff_t>(out->size());
-    const Vec3 low(c.x * kCellSize, -kInf, c.z * kCellSize);
-    engine.AppendPoses({low, Vec3(low.x() + kCellSize, kInf, low.z() + kCellSize)}, out);
+    const auto low = [](int32_t cell) { return cell > -kLastCell - 1 ? cell * kCellSize : -kInf; };
+    const auto high = [](int32_t cell) { return cell < kLastCell ? (cell + 1) * kCellSize : kInf; };
+    engine.AppendPoses({Vec3(low(c.x), -kInf, low(c.z)), Vec3(high(c.x), kInf, high(c.z))}, out);
     out->erase(
         std::remove_if(out->begin() + first, out->end(), [&c](const BodyPose& p) { return CellOf(p.position) != c; }),
         out->end());

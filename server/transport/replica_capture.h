@@ -15,6 +15,7 @@ namespace aureole {
 
 // What is watched, and when. Immutable.
 struct Watch {
+  uint64_t generation = 0;    // grows with every watch
   std::vector<Tick> periods;  // captures are due at multiples of any
   bool everything = false;    // else the cells
   absl::flat_hash_set<CellKey> cells;
@@ -52,7 +53,7 @@ class ReplicaCapture {
   void TakeCells(const Engine& engine, const std::vector<CellKey>& cells, std::vector<BodyPose>* out) const;
 
   std::shared_ptr<const Watch> watch_;  // of the capture before; null: none
-  std::vector<BodyId> last_;            // captured then in watched cells; ascending
+  std::vector<BodyId> last_;            // captured then in watched cells, but for those at rest; ascending
 };
 
 }  // namespace aureole

@@ -182,8 +182,11 @@ void ReplicaPublisher::EndAll(const grpc::Status& status) {
 void ReplicaPublisher::ChooseWatch() {
   std::shared_ptr<Watch> watch;
   int64_t subscribers = 0;
-  for (const auto& [key, audience] : audiences_) {
+  ++generation_;
+  for (auto& [key, audience] : audiences_) {
     if (watch == nullptr) watch = std::make_shared<Watch>();
+    watch->generation = generation_;
+    if (audience.watch == 0) audience.watch = generation_;
     subscribers += static_cast<int64_t>(audience.members.size());
     const ReplicaRequest& r = *audience.request;
     if (std::find(watch->periods.begin(), watch->periods.end(), r.period) == watch->periods.end()) {
@@ -208,6 +211,7 @@ void ReplicaPublisher::Publish() {
   bool gone = false;
   for (auto& [key, audience] : audiences_) {
     if (scene_.tick() % audience.request->period != 0) continue;
+    if (scene_.watch_generation() < audience.watch) continue;  // captured before it was known
     std::shared_ptr<const Shown> shown;
     // By what they were told before.
     std::map<const Shown*, Frame> frames;
@@ -218,7 +222,9 @@ void ReplicaPublisher::Publish() {
       if (shown == nullptr) shown = audience.last = Show(audience);
       const auto [it, fresh] = frames.try_emplace(m.base.get());
       if (fresh) it->second = MakeFrame(audience, m.base.get(), shown);
-      if (m.subscriber->Send(it->second.bytes, scene_.tick())) m.base = it->second.shown;
+      if (!m.subscriber->Send(it->second.bytes, scene_.tick())) continue;
+      m.base = it->second.shown;
+      bytes_sent_ += static_cast<int64_t>(it->second.bytes.size());
     }
   }
   if (scene_.tick() % kKeptFates == 0) scene_.Forget(scene_.tick() - kKeptFates);
@@ -253,10 +259,14 @@ void ReplicaPublisher::ShowCells(const Audience& audience, const std::vector<Cel
   const Tick frame = scene_.tick() / request.period;
   std::vector<std::pair<CellKey, std::shared_ptr<const CellState>>> shown;
   absl::flat_hash_map<CellKey, std::shared_ptr<const CellState>> held;  // cells that are not due
+  const bool joins =
+      std::any_of(audience.members.begin(), audience.members.end(), [](const Member& m) { return m.base == nullptr; });
   for (const CellKey& key : cells) {
     // Due at multiples; one that fell into a frame that nobody took is made up for.
     const int every = request.detail.Every(key);
-    if (every > 1 && audience.last != nullptr && frame / every == audience.last->tick / request.period / every) {
+    const bool made = audience.last != nullptr && frame / every == audience.last->tick / request.period / every;
+    // What another server handed over is told here at once; a new reader is told everything as it is now.
+    if (every > 1 && made && !joins && scene_.LastArrival(key) <= audience.last->tick) {
       const auto before = FindCell(audience.last->cells, key);
       if (before != audience.last->cells.end()) {
         held.emplace(key, before->second);

@@ -75,6 +75,8 @@ class ReplicaPublisher {
   void AfterTick(Region* region);
 
   int64_t subscribers() const { return subscribers_; }
+  // In frames, since the start.
+  int64_t bytes_sent() const { return bytes_sent_; }
   // The tick of the last state that was published.
   Tick published() const { return published_; }
 
@@ -99,6 +101,7 @@ class ReplicaPublisher {
     std::shared_ptr<const ReplicaRequest> request;
     std::vector<Member> members;
     std::shared_ptr<const Shown> last;  // made for it
+    uint64_t watch = 0;                 // the first generation that holds its view; 0: not yet chosen
   };
 
   void Loop();
@@ -122,6 +125,7 @@ class ReplicaPublisher {
   ReplicaCapture capture_;
   std::atomic<int64_t> subscribers_ = 0;
   std::atomic<Tick> published_ = 0;
+  std::atomic<int64_t> bytes_sent_ = 0;
 
   std::mutex mutex_;
   std::condition_variable changed_;
@@ -137,6 +141,7 @@ class ReplicaPublisher {
   std::map<std::string, Audience> audiences_;
   std::map<std::tuple<const CellState*, const CellState*, CellFormat>, EncodedCell> encoded_;  // of this tick
   std::deque<std::pair<Clock::time_point, Tick>> pace_;
+  uint64_t generation_ = 0;  // of watches
 
   std::thread thread_;
 };

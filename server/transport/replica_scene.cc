@@ -92,6 +92,11 @@ const std::string* ReplicaScene::Look(BodyId id) const {
   return it == bodies_.end() ? nullptr : &it->second.look;
 }
 
+Tick ReplicaScene::LastArrival(const CellKey& cell) const {
+  const auto it = cells_.find(cell);
+  return it == cells_.end() ? 0 : it->second.arrival;
+}
+
 const CellKey* ReplicaScene::CellOfBody(BodyId id) const {
   const auto it = bodies_.find(id);
   return it == bodies_.end() ? nullptr : &it->second.cell;
@@ -114,8 +119,9 @@ void ReplicaScene::Put(BodyId id, Body* body, const CellKey& cell) {
   if (!placed || body->cell != cell) {
     if (placed) TakeOut(id, body->cell);
     body->cell = cell;
-    std::vector<BodyId>& ids = cells_[cell].ids;
-    ids.insert(std::lower_bound(ids.begin(), ids.end(), id), id);
+    Cell& to = cells_[cell];
+    to.ids.insert(std::lower_bound(to.ids.begin(), to.ids.end(), id), id);
+    if (!placed) to.arrival = tick_;
   }
   ++cells_[cell].version;
 }

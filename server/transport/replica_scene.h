@@ -21,6 +21,8 @@ class ReplicaScene {
   void Apply(const Capture& capture);
 
   Tick tick() const { return tick_; }
+  // Of the watch that this is the state of.
+  uint64_t watch_generation() const { return watch_ != nullptr ? watch_->generation : 0; }
   // Calls fn(const CellKey&) for every cell that has bodies, in no particular order.
   template <class Fn>
   void ForEachCell(Fn&& fn) const {
@@ -31,6 +33,8 @@ class ReplicaScene {
   std::shared_ptr<const CellState> State(const CellKey& cell, Precision precision);
   // The serialised BodyDescription without the body; null when the body is not here.
   const std::string* Look(BodyId id) const;
+  // The state in which a body last came into the cell from elsewhere than another cell; 0: none did.
+  Tick LastArrival(const CellKey& cell) const;
   // Null when the body is not here.
   const CellKey* CellOfBody(BodyId id) const;
   // Where bodies went, since the last Forget.
@@ -56,8 +60,9 @@ class ReplicaScene {
     std::array<bool, 2> valid{};             // of these
   };
   struct Cell {
-    std::vector<BodyId> ids;                                 // ascending
-    uint64_t version = 1;                                    // grows with every change
+    std::vector<BodyId> ids;  // ascending
+    uint64_t version = 1;     // grows with every change
+    Tick arrival = 0;
     std::array<std::shared_ptr<const CellState>, 3> states;  // by precision
     std::array<uint64_t, 3> state_versions{};
   };

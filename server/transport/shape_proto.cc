@@ -1,11 +1,20 @@
 #include "server/transport/shape_proto.h"
 
+#include <cmath>
+
 namespace aureole {
 
 void SetVec3(const Vec3& v, v1::Vec3* out) {
   out->set_x(v.x());
   out->set_y(v.y());
   out->set_z(v.z());
+}
+
+void SetQuat(const Quat& q, v1::Quaternion* out) {
+  out->set_x(q.x());
+  out->set_y(q.y());
+  out->set_z(q.z());
+  out->set_w(q.w());
 }
 
 v1::Shape ShapeToProto(const Shape& shape) {
@@ -32,10 +41,7 @@ v1::Shape ShapeToProto(const Shape& shape) {
       for (const ChildShape& child : shape.children) {
         auto* c = out.mutable_compound()->add_children();
         SetVec3(child.position, c->mutable_position());
-        c->mutable_orientation()->set_x(child.orientation.x());
-        c->mutable_orientation()->set_y(child.orientation.y());
-        c->mutable_orientation()->set_z(child.orientation.z());
-        c->mutable_orientation()->set_w(child.orientation.w());
+        SetQuat(child.orientation, c->mutable_orientation());
         *c->mutable_shape() = ShapeToProto(*child.shape);
       }
       break;
@@ -54,6 +60,39 @@ v1::Shape ShapeToProto(const Shape& shape) {
       out.mutable_heightfield()->mutable_heights()->Add(shape.heights.begin(), shape.heights.end());
       break;
   }
+  return out;
+}
+
+namespace {
+
+google::protobuf::Duration ToDuration(double seconds) {
+  const auto us = static_cast<int64_t>(std::llround(seconds * 1e6));
+  google::protobuf::Duration out;
+  out.set_seconds(us / 1'000'000);
+  out.set_nanos(static_cast<int32_t>(us % 1'000'000 * 1000));
+  return out;
+}
+
+void AddKey(double time, const Vec3& position, const Quat& orientation, v1::FixedBody* out) {
+  v1::Mover::Key* key = out->add_keys();
+  *key->mutable_time() = ToDuration(time);
+  SetVec3(position, key->mutable_position());
+  SetQuat(orientation, key->mutable_orientation());
+}
+
+}  // namespace
+
+v1::FixedBody FixedToProto(const BodySpec& body) {
+  v1::FixedBody out;
+  out.set_body(body.id);
+  *out.mutable_shape() = ShapeToProto(*body.shape);
+  *out.mutable_material() = MaterialToProto(body.material);
+  if (body.script == nullptr) {
+    AddKey(0, body.position, body.orientation, &out);
+    return out;
+  }
+  for (const Script::Key& key : body.script->keys) AddKey(key.time, key.position, key.orientation, &out);
+  if (body.script->period > 0) *out.mutable_period() = ToDuration(body.script->period);
   return out;
 }
 

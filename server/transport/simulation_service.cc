@@ -7,10 +7,12 @@
 #include "server/transport/error_status.h"
 #include "server/transport/play_stream.h"
 #include "server/transport/replica_stream.h"
+#include "server/transport/shape_proto.h"
 
 namespace aureole {
 
-grpc::ServerUnaryReactor* SimulationService::GetWorld(grpc::CallbackServerContext* context, const v1::GetWorldRequest*,
+grpc::ServerUnaryReactor* SimulationService::GetWorld(grpc::CallbackServerContext* context,
+                                                      const v1::GetWorldRequest* request,
                                                       v1::GetWorldResponse* response) {
   grpc::ServerUnaryReactor* reactor = context->DefaultReactor();
   const std::lock_guard lock(mutex_);
@@ -21,6 +23,7 @@ grpc::ServerUnaryReactor* SimulationService::GetWorld(grpc::CallbackServerContex
   *response = world_;
   response->set_tick(tick_);
   response->set_bodies(bodies_);
+  if (request->scene()) *response->mutable_scene() = scene_;
   reactor->Finish(grpc::Status::OK);
   return reactor;
 }
@@ -80,6 +83,11 @@ grpc::ServerUnaryReactor* SimulationService::CastRays(grpc::CallbackServerContex
   return rays_.Cast(*request, response);
 }
 
+grpc::ServerWriteReactor<v1::LayoutUpdate>* SimulationService::WatchLayout(grpc::CallbackServerContext* context,
+                                                                           const v1::WatchLayoutRequest* request) {
+  return layout_.Watch(context, *request);
+}
+
 void SimulationService::Serve(const v1::Assignment& assignment, const World& world) {
   inputs_.Serve(assignment.world(), world.environment.tick_us);
   rays_.Serve();
@@ -100,11 +108,15 @@ void SimulationService::Serve(const v1::Assignment& assignment, const World& wor
     out->set_min_z(rect.min_z);
     out->set_max_z(rect.max_z);
   }
+  scene_.Clear();
+  for (const BodySpec& body : world.environment.fixed) *scene_.Add() = FixedToProto(body);
+  layout_.Serve(world_);
 }
 
 void SimulationService::Stop() {
   inputs_.Stop();
   rays_.Stop();
+  layout_.Stop();
   replicas_.Stop(RegionGivenUp());
   const std::lock_guard lock(mutex_);
   serving_ = false;
@@ -115,6 +127,11 @@ void SimulationService::AfterTick(Region* region, int64_t bodies) {
   bodies_ = bodies;
   rays_.Answer(*region);
   replicas_.AfterTick(region);
+  layout_.AfterTick(*region);
+}
+
+void SimulationService::Report(const v1::Report& report) {
+  layout_.Report(report, replicas_.subscribers(), replicas_.bytes_sent());
 }
 
 }  // namespace aureole

@@ -13,17 +13,18 @@
 #include "server/core/region.h"
 #include "server/core/world.h"
 #include "server/transport/input_service.h"
+#include "server/transport/layout_service.h"
 #include "server/transport/ray_service.h"
 #include "server/transport/replica_publisher.h"
 
 namespace aureole {
 
 // As generated, but for replicas, which are written as bytes that many calls share.
-using SimulationCalls =
-    v1::Simulation::WithCallbackMethod_GetWorld<v1::Simulation::WithRawCallbackMethod_StreamReplicas<
-        v1::Simulation::WithRawCallbackMethod_Play<v1::Simulation::WithCallbackMethod_ApplyImpulses<
-            v1::Simulation::WithCallbackMethod_SpawnBodies<v1::Simulation::WithCallbackMethod_RemoveBodies<
-                v1::Simulation::WithCallbackMethod_CastRays<v1::Simulation::Service>>>>>>>;
+using SimulationCalls = v1::Simulation::WithCallbackMethod_GetWorld<
+    v1::Simulation::WithRawCallbackMethod_StreamReplicas<v1::Simulation::WithRawCallbackMethod_Play<
+        v1::Simulation::WithCallbackMethod_ApplyImpulses<v1::Simulation::WithCallbackMethod_SpawnBodies<
+            v1::Simulation::WithCallbackMethod_RemoveBodies<v1::Simulation::WithCallbackMethod_CastRays<
+                v1::Simulation::WithCallbackMethod_WatchLayout<v1::Simulation::Service>>>>>>>>;
 
 class SimulationService final : public SimulationCalls {
  public:
@@ -41,6 +42,9 @@ class SimulationService final : public SimulationCalls {
   grpc::ServerUnaryReactor* RemoveBodies(grpc::CallbackServerContext* context, const v1::RemoveBodiesRequest* request,
                                          v1::RemoveBodiesResponse* response) override;
 
+  grpc::ServerWriteReactor<v1::LayoutUpdate>* WatchLayout(grpc::CallbackServerContext* context,
+                                                          const v1::WatchLayoutRequest* request) override;
+
   // What clients do to the world.
   InputService& inputs() { return inputs_; }
 
@@ -50,16 +54,20 @@ class SimulationService final : public SimulationCalls {
   void Stop();
   // After each tick, from the tick thread; `bodies`: that this region owns. Cost: ReplicaPublisher::AfterTick.
   void AfterTick(Region* region, int64_t bodies);
+  // From the tick thread: how it does.
+  void Report(const v1::Report& report);
 
  private:
   InputService inputs_;
   RayService rays_;
   ReplicaPublisher replicas_;
+  LayoutService layout_;
   std::atomic<Tick> tick_ = 0;
   std::atomic<int64_t> bodies_ = 0;
   std::mutex mutex_;
   bool serving_ = false;
-  v1::GetWorldResponse world_;
+  v1::GetWorldResponse world_;  // without scene
+  google::protobuf::RepeatedPtrField<v1::FixedBody> scene_;
 };
 
 }  // namespace aureole

@@ -29,6 +29,8 @@ class BodyIds {
 struct BodyReader {
   // Counts the bodies and claims the given ids.
   BodyReader(const v1::WorldSpec& s, SpecCheck* c);
+  // With the same shapes and materials, for one message of a client.
+  BodyReader(const BodyReader& names, SpecCheck* c) : check(c), catalogue(names.catalogue, c), ids(c) {}
 
   // Appends the body and its copies.
   void Dynamic(const Path& path, const v1::Body& from, std::vector<BodySpec>* out);

@@ -57,6 +57,7 @@ double Volume(const Shape& s) {
 }
 
 Catalogue::Catalogue(const v1::WorldSpec& spec, SpecCheck* check) : check_(check) {
+  std::map<std::string, Material> materials;
   for (const auto& [name, m] : Sorted(spec.materials())) {
     const Path path = (Path() / "materials")[name];
     Material out;
@@ -68,13 +69,21 @@ Catalogue::Catalogue(const v1::WorldSpec& spec, SpecCheck* check) : check_(check
     if (m.has_angular_damping()) {
       out.angular_damping = check->In(limits::kShare, path / "angular_damping", m.angular_damping());
     }
-    materials_[name] = out;
+    materials[name] = out;
   }
+  materials_ = std::make_shared<const std::map<std::string, Material>>(std::move(materials));
   // A named shape that uses a name would need an order; it does not find any yet.
   std::map<std::string, std::shared_ptr<const Shape>> shapes;
-  for (const auto& [name, shape] : Sorted(spec.shapes())) shapes[name] = Any((Path() / "shapes")[name], shape);
-  shapes_ = std::move(shapes);
+  shapes_ = std::make_shared<const std::map<std::string, std::shared_ptr<const Shape>>>();
+  for (const auto& [name, shape] : Sorted(spec.shapes())) {
+    shapes[name] = Any((Path() / "shapes")[name], shape);
+    CachedVolume(shapes[name]);
+  }
+  shapes_ = std::make_shared<const std::map<std::string, std::shared_ptr<const Shape>>>(std::move(shapes));
 }
+
+Catalogue::Catalogue(const Catalogue& names, SpecCheck* check)
+    : check_(check), shapes_(names.shapes_), materials_(names.materials_), volumes_(names.volumes_) {}
 
 double Catalogue::CachedVolume(const std::shared_ptr<const Shape>& shape) {
   const auto [it, inserted] = volumes_.try_emplace(shape, 0.0);
@@ -83,8 +92,8 @@ double Catalogue::CachedVolume(const std::shared_ptr<const Shape>& shape) {
 }
 
 Material Catalogue::MaterialOf(const Path& path, const std::string& name) const {
-  const auto it = materials_.find(name.empty() ? "default" : name);
-  if (it != materials_.end()) return it->second;
+  const auto it = materials_->find(name.empty() ? "default" : name);
+  if (it != materials_->end()) return it->second;
   if (!name.empty()) check_->Fail(path, absl::StrCat("there is no material \"", name, "\" in materials"));
   return {};
 }
@@ -108,8 +117,8 @@ std::shared_ptr<const Shape> Catalogue::Make(const Path& path, const v1::Shape& 
   Shape out;
   switch (spec.kind_case()) {
     case v1::Shape::kNamed: {
-      const auto it = shapes_.find(spec.named());
-      if (it != shapes_.end()) return it->second;
+      const auto it = shapes_->find(spec.named());
+      if (it != shapes_->end()) return it->second;
       check_->Fail(path / "named",
                    absl::StrCat("there is no shape \"", spec.named(), "\" in shapes that could be used ",
                                 "here; named shapes are written without names"));

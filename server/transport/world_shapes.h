@@ -19,6 +19,9 @@ class Catalogue {
   // Reads the spec's `shapes` and `materials`. `check` outlives the catalogue.
   Catalogue(const v1::WorldSpec& spec, SpecCheck* check);
 
+  // The same names, for what is told to another `check`. What it reads itself it forgets with itself.
+  Catalogue(const Catalogue& names, SpecCheck* check);
+
   // For a body that moves freely or by a script: planes, meshes and heightfields are refused. Never null.
   std::shared_ptr<const Shape> Moving(const Path& path, const v1::Shape& spec) const;
   // Any kind. Never null.
@@ -47,8 +50,8 @@ class Catalogue {
   double CachedVolume(const std::shared_ptr<const Shape>& shape);
 
   SpecCheck* check_;
-  std::map<std::string, std::shared_ptr<const Shape>> shapes_;
-  std::map<std::string, Material> materials_;
+  std::shared_ptr<const std::map<std::string, std::shared_ptr<const Shape>>> shapes_;
+  std::shared_ptr<const std::map<std::string, Material>> materials_;
   std::map<std::shared_ptr<const Shape>, double> volumes_;  // a hull's is slow to find
 };
 

@@ -232,6 +232,21 @@ class Input(Cli):
             self.assertIn("Exit codes: 0 ", out)
 
 
+class Completion(Cli):
+    def test_scripts_complete_commands_and_options(self):
+        for shell in ("bash", "zsh", "fish"):
+            code, out, err = self.run_cli("completion", shell)
+            self.assertEqual(code, 0, err)
+            for word in ("record", "replay", "hash-every"):
+                self.assertIn(word, out)
+        script = self.run_cli("completion", "bash")[1]
+        typed = script + "COMP_WORDS=(aureole rep); COMP_CWORD=1; _aureole; echo ${COMPREPLY[@]};"
+        typed += "COMP_WORDS=(aureole replay --ver); COMP_CWORD=2; _aureole; echo ${COMPREPLY[@]}"
+        out = subprocess.run(["bash", "-c", typed], capture_output=True, text=True, check=True).stdout
+        self.assertEqual(out.split("\n")[:2], ["replay report", "--verify"])
+        self.assertEqual(self.run_cli("completion", "tcsh")[0], 2)
+
+
 class Clients(Cli):
     def setUp(self):
         super().setUp()
@@ -290,6 +305,55 @@ class Clients(Cli):
         self.assertEqual(load["failed_streams"], 0)
         self.assertGreater(load["least_frames_per_second"], 15)
         self.assertGreater(load["pushes"]["applied"], 50)
+
+    def test_recording_replays_bit_for_bit_and_is_reported(self):
+        file = self.path / "run.mcap"
+        record = self.start("record", "--server", self.servers[1], "--out", file, "--duration", "4s", "--json")
+        self.ask("spawn", "--shape", "sphere:0.5", "--position", "0,9,0")
+        self.ask("push", "--sphere", "0,1,0,10", "--outward", "50", server=2)
+        out, err = record.communicate(timeout=DEADLINE_S)
+        self.assertEqual(record.returncode, 0, err)
+        self.assertGreaterEqual(json.loads(out)["seconds"], 4)
+        code, out, err = self.run_cli("replay", file, "--verify", "--json")
+        self.assertEqual(code, 0, out + err)
+        replay = json.loads(out)
+        self.assertTrue(replay["equal"])
+        self.assertGreater(replay["compared_states"], 200 * 10)
+        code, out, err = self.run_cli("report", file, "--json")
+        self.assertEqual(code, 0, err)
+        self.assertEqual(len(json.loads(out)["regions"]), 4)
+        svg = (self.path / "run.svg").read_text()
+        for word in ("Frame time", "Dilation", "Transfers", "Energy", "region 3"):
+            self.assertIn(word, svg)
+        self.assertNotIn("nan", svg)
+        # Cut off, it is replayed as far as it goes; with another state it differs.
+        whole = file.read_bytes()
+        (self.path / "cut.mcap").write_bytes(whole[:len(whole) * 9 // 10])
+        code, out, err = self.run_cli("replay", self.path / "cut.mcap", "--verify")
+        self.assertIn("cut off", err)
+        self.assertEqual(code, 0, out + err)
+        self.assertIn("equal, bit for bit", out)
+        for name, text in (("not-there.mcap", None), ("text.mcap", b"no recording")):
+            if text is not None:
+                (self.path / name).write_bytes(text)
+            for command in ("replay", "report"):
+                code, _, err = self.run_cli(command, self.path / name)
+                self.assertEqual(code, 2, err)
+                self.assertIn(name, err)
+
+    def test_top_and_doctor_tell_how_the_servers_do(self):
+        out, _ = self.ask("top", "--duration", "2s", "--json", server=3)
+        last = json.loads(out.splitlines()[-1])
+        self.assertEqual([r["server"] for r in last["regions"]], self.servers)
+        self.assertGreater(last["bodies"], 200)
+        self.assertTrue(all(r["up"] and r["tick"] > 0 for r in last["regions"]))
+        out, _ = self.ask("doctor", "--json")
+        findings = json.loads(out)
+        self.assertNotIn("FAILURE", [f["level"] for f in findings])
+        self.assertIn("world demo on 4 region servers", [f["what"] for f in findings])
+        code, out, _ = self.run_cli("doctor", "--server", "127.0.0.1:1")
+        self.assertEqual(code, 1)
+        self.assertIn("FAILURE", out)
 
     def test_bad_input_is_named(self):
         for arguments, word in ((["spawn", "--shape", "cube:1", "--position", "0,0,0"], "--shape"),

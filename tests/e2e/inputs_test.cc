@@ -3,14 +3,24 @@
 #include <gtest/gtest.h>
 
 #include <grpcpp/grpcpp.h>
+#include <signal.h>
+#include <sys/wait.h>
+#include <unistd.h>
 
 #include <cmath>
+#include <filesystem>
 #include <map>
 #include <memory>
 #include <string>
+#include <thread>
 #include <vector>
 
+#include <absl/strings/str_cat.h>
+
 #include "aureole/v1/simulation.grpc.pb.h"
+#include "client/cli/exit_codes.h"
+#include "client/cli/recording.h"
+#include "client/cli/replay.h"
 #include "client/src/replica_decoder.h"
 #include "tests/e2e/running_world.h"
 
@@ -88,6 +98,13 @@ class Client {
     return stub_->RemoveBodies(&context, request, response != nullptr ? response : &ignored);
   }
 
+  int64_t Tick() {
+    grpc::ClientContext context;
+    v1::GetWorldResponse world;
+    EXPECT_TRUE(stub_->GetWorld(&context, {}, &world).ok());
+    return world.tick();
+  }
+
   // Velocities along x of the bodies that this region owns.
   void AddVelocities(std::map<uint64_t, double>* out) {
     grpc::ClientContext context;
@@ -157,6 +174,71 @@ TEST(Inputs, EachActsOnceWhereverItsBodyIsAndWhoeverIsAsked) {
   });
 }
 
+// 100,000 pushes in bursts at bodies that change servers, over a connection that is cut 50 times, while the servers'
+// links are cut too: each acts once, and the recording of it all is, bit for bit, what one server computes.
+TEST(Inputs, HundredThousandActOnceEachAndReplayTheSame) {
+  constexpr int kCuts = 50, kPerCut = 2000;
+  v1::WorldSpec world = Lanes();
+  world.mutable_client_limits()->set_rate(1e6);
+  const std::filesystem::path file =
+      std::filesystem::path(testing::TempDir()) / absl::StrCat("pushes-", getpid(), ".mcap");
+  PlayRun(world, 4, [&](const RunStatus& status) {
+    std::vector<std::string> endpoints;
+    for (const RegionStatus& r : status.regions) endpoints.push_back(r.endpoint);
+    const pid_t recorder = fork();
+    if (recorder == 0) {
+      execl(AUREOLE_PROGRAM, "aureole", "record", "--server", endpoints[0].c_str(), "--out", file.c_str(), "--rate",
+            "0", "--hash-every", "10", nullptr);
+      _exit(127);
+    }
+    // It begins half a second from when it asks.
+    const int64_t begun = Client(endpoints[0]).Tick() + 150;
+    while (Client(endpoints[0]).Tick() < begun) std::this_thread::sleep_for(std::chrono::milliseconds(20));
+    std::map<uint64_t, double> expected;
+    for (uint64_t body = 1; body <= kBodies; ++body) expected[body] = StartVelocity(body);
+    int64_t applied = 0;
+    for (int cut = 0; cut < kCuts; ++cut) {
+      std::vector<v1::Impulse> burst;
+      for (int i = 0; i < kPerCut; ++i) {
+        const uint64_t n = static_cast<uint64_t>(cut) * kPerCut + static_cast<uint64_t>(i) + 1;
+        const uint64_t body = 1 + n * 7 % kBodies;
+        const double push = n / kBodies % 2 == 0 ? kPush : -kPush;  // so that nothing flies off
+        burst.push_back(Push(n, body));
+        burst.back().mutable_impulse()->set_x(push);
+        expected[body] += push;
+      }
+      v1::ImpulseSummary summary;
+      const std::vector<v1::Impulse> some(burst.begin(), burst.begin() + 37 * (cut + 1));
+      Client(endpoints[static_cast<size_t>(cut) % 4]).Send(77, some, &summary, true);
+      if (cut % 5 == 4) {
+        for (const RegionStatus& r : status.regions) kill(static_cast<pid_t>(r.pid), SIGUSR1);
+      }
+      summary.Clear();
+      const grpc::Status s = Client(endpoints[static_cast<size_t>(cut + 1) % 4]).Send(77, burst, &summary, false);
+      ASSERT_TRUE(s.ok()) << s.error_message();
+      ASSERT_EQ(summary.rejected_size(), 0) << summary.ShortDebugString();
+      applied += summary.applied();
+    }
+    EXPECT_EQ(applied, kCuts * kPerCut);
+    std::map<uint64_t, double> velocities;
+    for (int attempt = 0; attempt < 100 && velocities.size() < kBodies; ++attempt) {
+      for (const std::string& endpoint : endpoints) Client(endpoint).AddVelocities(&velocities);
+    }
+    EXPECT_EQ(velocities, expected);
+    kill(recorder, SIGINT);
+    int exit = -1;
+    ASSERT_EQ(waitpid(recorder, &exit, 0), recorder);
+    EXPECT_EQ(exit, 0);
+  });
+  const absl::StatusOr<RecordedRun> recorded = ReadRecording(file.string());
+  ASSERT_TRUE(recorded.ok()) << recorded.status();
+  EXPECT_TRUE(recorded->whole);
+  EXPECT_EQ(recorded->inputs.size(), size_t{kCuts} * kPerCut);
+  EXPECT_GT(recorded->hashes.size(), 10u);
+  EXPECT_EQ(RunReplay({.file = file.string(), .verify = true}), kExitOk);
+  std::filesystem::remove(file);
+}
+
 TEST(Inputs, WhatIsNowhereOrTooMuchIsRejectedAloneWithTheReason) {
   v1::WorldSpec world = Lanes();
   world.mutable_client_limits()->set_impulse(100);
@@ -175,6 +257,22 @@ TEST(Inputs, WhatIsNowhereOrTooMuchIsRejectedAloneWithTheReason) {
     EXPECT_GE(rejected[v1::RATE_LIMIT].first, 1);
     EXPECT_GT(rejected[v1::RATE_LIMIT].second, 50u) << "the first 50 are allowed at once";
     EXPECT_EQ(summary.applied() + rejected[v1::RATE_LIMIT].first + 2, 59);
+  });
+}
+
+// What has acted must not be told as rejected.
+TEST(Inputs, RepetitionsAreNotChargedAgainstTheRate) {
+  v1::WorldSpec world = Lanes();
+  world.mutable_client_limits()->set_rate(20);
+  PlayIn(world, 4, [](const std::vector<std::string>& endpoints) {
+    Client client(endpoints[1]);
+    std::vector<v1::Impulse> pushes;
+    for (uint64_t n = 1; n <= 20; ++n) pushes.push_back(Push(n, 1 + n % kBodies));
+    for (int repetition = 0; repetition < 3; ++repetition) {
+      v1::ImpulseSummary summary;
+      ASSERT_TRUE(client.Send(77, pushes, &summary, false).ok());
+      EXPECT_EQ(summary.applied(), 20) << summary.ShortDebugString();
+    }
   });
 }
 

@@ -94,7 +94,7 @@ class Cluster {
       hooks.inputs = [] { return std::vector<Input>(); };
       hooks.outcomes = [](const std::vector<InputOutcome>&) {};
       hooks.after_tick = [](const FrameSample&) {};
-      hooks.publish = [this](Region* region, int64_t) {
+      hooks.publish = [this](Region* region, int64_t, const std::vector<Input>&) {
         const std::lock_guard lock(mutex_);
         progress_ = std::max(progress_, region->tick());
         changed_.notify_all();

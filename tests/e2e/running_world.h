@@ -12,9 +12,8 @@
 
 namespace aureole {
 
-// Calls `play` with the servers' endpoints, in order, once all have stepped a few ticks; then ends them.
-inline void PlayIn(const v1::WorldSpec& world, int regions,
-                   const std::function<void(const std::vector<std::string>& endpoints)>& play) {
+// Calls `play` once all servers have stepped a few ticks; then ends them.
+inline void PlayRun(const v1::WorldSpec& world, int regions, const std::function<void(const RunStatus&)>& play) {
   RunOptions options;
   options.world = world;
   options.regions = regions;
@@ -25,15 +24,23 @@ inline void PlayIn(const v1::WorldSpec& world, int regions,
       options, allocator,
       [&](const RunStatus& status) {
         if (status.stage != Stage::kRunning || status.MinTick() < 5) return true;
-        std::vector<std::string> endpoints;
-        for (const RegionStatus& r : status.regions) endpoints.push_back(r.endpoint);
-        play(endpoints);
+        play(status);
         played = true;
         return false;
       },
       &result);
   EXPECT_EQ(end.code(), absl::StatusCode::kCancelled) << end;
   EXPECT_TRUE(played);
+}
+
+// The same, with the servers' endpoints, in order.
+inline void PlayIn(const v1::WorldSpec& world, int regions,
+                   const std::function<void(const std::vector<std::string>& endpoints)>& play) {
+  PlayRun(world, regions, [&](const RunStatus& status) {
+    std::vector<std::string> endpoints;
+    for (const RegionStatus& r : status.regions) endpoints.push_back(r.endpoint);
+    play(endpoints);
+  });
 }
 
 }  // namespace aureole

@@ -361,6 +361,28 @@ TEST(Physics, SpeedLimitClampsSpawnsInputsAndSteps) {
   EXPECT_NEAR(engine->View(7).velocity.norm(), 20, 0.1);
 }
 
+TEST(Physics, ABodyThatIsStruckHoweverHardStaysInSpace) {
+  const auto engine = MakeBulletEngine(Ground());
+  BodySpec body = Dynamic(7, SphereShape(0.001), Vec3(0, 1, 0));
+  body.mass = 1e-6;
+  body.ccd = true;
+  engine->Spawn(body);
+  engine->Spawn(Dynamic(8, BoxShape(0.5, 0.5, 0.5), Vec3(3, 0.5, 0)));
+  Tick n = 0;
+  for (double newton_seconds : {1e9, 1e12}) {
+    Input kick = Kick(7, Vec3(newton_seconds, newton_seconds, 0));
+    kick.angular = Vec3(0, newton_seconds, 0);
+    engine->Apply(kick);
+    for (Tick end = n + 200; n < end;) engine->Step(++n);
+    const BodyPose pose = engine->Pose(7);
+    EXPECT_LE(pose.velocity.norm(), 1.001e5);
+    EXPECT_LE(pose.angular_velocity.norm(), 1.001e5);
+    EXPECT_LT(pose.position.norm(), 1e8);
+    const std::string state = engine->Save(std::vector<BodyId>{7});
+    EXPECT_TRUE(engine->Scratch()->Restore(state).ok()) << "it can be handed over";
+  }
+}
+
 TEST(Physics, KinematicPlatformCarriesABoxByFriction) {
   Environment e;
   BodySpec platform = StaticBody(1, BoxShape(3, 0.1, 3), Vec3(0, 0, 0));

@@ -1,17 +1,15 @@
 // Regions in lock-step without a network, for tests that ask who owns what.
 #pragma once
 
-#include <algorithm>
 #include <cstdio>
 #include <cstdlib>
 #include <map>
 #include <memory>
 #include <vector>
 
-#include "server/core/apply_input.h"
-#include "server/core/input_schedule.h"
 #include "server/core/region.h"
 #include "server/core/toy_engine.h"
+#include "server/core/undivided.h"
 
 namespace aureole::sim {
 
@@ -86,38 +84,10 @@ class Lockstep {
   std::vector<Frame> last_;
 };
 
-// The same world in one piece: the engine without any aura code.
-class Undivided {
+class Undivided : public aureole::Undivided {
  public:
   explicit Undivided(const World& world, std::unique_ptr<Engine> (*make)(const Environment&) = MakeToyEngine)
-      : world_(world), engine_(make(world.environment)) {
-    for (const BodySpec& b : world.bodies) engine_->Spawn(b);
-    for (const JointSpec& j : world.joints) engine_->Join(j);
-  }
-  // Takes effect at its tick, which is to come.
-  void Add(const Input& input) { live_.Add(input); }
-  void RunTo(Tick n) {
-    while (tick_ < n) {
-      std::vector<Input> inputs;
-      ScriptedInputs(world_, ++tick_, &inputs);
-      live_.AppendDue(tick_, &inputs);
-      std::sort(inputs.begin(), inputs.end());
-      for (const Input& i : inputs) ApplyInput(i, engine_.get());
-      engine_->Step(tick_);
-    }
-  }
-  uint64_t Hash() const {
-    uint64_t sum = 0;
-    for (BodyId id : engine_->Ids()) sum += BodyHash(id, engine_->Hash(id));
-    return sum;
-  }
-  const Engine& engine() const { return *engine_; }
-
- private:
-  const World& world_;
-  std::unique_ptr<Engine> engine_;
-  InputSchedule live_;
-  Tick tick_ = 0;
+      : aureole::Undivided(world, make(world.environment)) {}
 };
 
 }  // namespace aureole::sim

@@ -398,6 +398,129 @@ TEST(Replicas, WhatCrossesBetweenNearAndFarCellsIsNeverLostOrDoubled) {
   EXPECT_GT(late, 10000) << "far bodies come less often";
 }
 
+TEST(Replicas, WhatChangesServersFarFromTheEyeIsNeverLost) {
+  World world(*Layout::Columns(std::vector<double>{-100, 0, 100}));
+  world.environment.gravity = Vec3::Zero();
+  sim::Random rng(9);
+  for (BodyId id = 1; id <= 100; ++id) {
+    world.bodies.push_back(
+        Ball(id, {rng.In(-200, 200), 3.0 * static_cast<double>(id), rng.In(-50, 50)}, {rng.In(-30, 30), 0, 0}));
+  }
+  v1::StreamReplicasRequest request = EveryTick();
+  request.mutable_level_of_detail()->mutable_eye()->set_z(2000);
+  request.mutable_level_of_detail()->set_full_within(10);
+  Watched w(world, request);
+  std::vector<LostBody> lost;
+  for (Tick n = 1; n <= 400; ++n) {
+    w.Step(n);
+    for (RegionId r = 0; r < w.regions(); ++r) w.Take(r, &lost);
+    ASSERT_TRUE(lost.empty()) << "body " << lost[0].body << " at tick " << n;
+    ASSERT_EQ(w.merger().bodies().size(), 100u) << n;
+  }
+  EXPECT_GT(w.split().BodiesMoved(), 50);
+}
+
+// Thousands of bodies over three borders, every frame of every server read: none is ever missing, doubled or flickers.
+TEST(Replicas, FiveThousandBodiesChangeServersTenThousandTimesAndNobodySees) {
+  World world(*Layout::Columns(std::vector<double>{-40, 0, 40}));
+  world.environment.gravity = Vec3::Zero();
+  constexpr int kBodies = 5000;
+  sim::Random rng(11);
+  for (BodyId id = 1; id <= kBodies; ++id) {  // in lanes
+    const double speed = rng.In(15, 30) * (rng.Chance(0.5) ? 1 : -1);
+    const double way = speed > 0 ? -1 : 1;
+    world.bodies.push_back(
+        Ball(id, {way * rng.In(30, 90), 3.0 * static_cast<double>(id / 70), 3.0 * (id % 70)}, {speed, 0, 0}));
+  }
+  const v1::StreamReplicasRequest request = EveryTick();
+  Watched w(world, request);
+  std::vector<LostBody> lost;
+  for (Tick n = 1; w.split().BodiesMoved() < 10'000; ++n) {
+    ASSERT_LT(n, 1000) << "few change servers: " << w.split().BodiesMoved();
+    w.Step(n);
+    for (RegionId r = 0; r < w.regions(); ++r) {
+      ASSERT_NO_FATAL_FAILURE(w.Take(r, &lost));
+      ASSERT_NO_FATAL_FAILURE(ExpectSameState(&w, r, request));
+      ASSERT_TRUE(lost.empty()) << "body " << lost[0].body << " at tick " << n << " after a frame of region " << r;
+    }
+    ASSERT_EQ(w.merger().bodies().size(), size_t{kBodies}) << n;
+    for (RegionId r = 0; r < w.regions(); ++r) {
+      for (const auto& [id, pose] : w.Truth(r)) {
+        const MergedBody& merged = w.merger().bodies().at(id);
+        ASSERT_EQ(merged.region, r) << "body " << id << ", tick " << n;
+        ASSERT_LE(Off(merged.state, pose), 0.5e-3) << "body " << id << ", tick " << n;
+      }
+    }
+  }
+}
+
+TEST(Replicas, SleeperThatIsStruckOutOfViewIsNoGhost) {
+  World world = OneRegion();
+  world.bodies.push_back(Ball(1, {31.5, 0, 16}, Vec3::Zero()));
+  world.bodies.push_back(Ball(2, {16, 0, 16}, Vec3::Zero()));
+  for (BodySpec& b : world.bodies) b.asleep = true;
+  for (BodyId id = 3; id <= 60; ++id) {  // enough that move elsewhere
+    world.bodies.push_back(Ball(id, {1000, 0, 8.0 * static_cast<double>(id)}, {1, 0, 0}));
+  }
+  v1::StreamReplicasRequest request = EveryTick();
+  request.mutable_view()->mutable_box()->mutable_max()->set_x(31);
+  request.mutable_view()->mutable_box()->mutable_max()->set_z(31);
+  Watched w(world, request);
+  std::vector<LostBody> lost;
+  for (Tick n = 1; n <= 10; ++n) w.Step(n);
+  w.Take(0, &lost);
+  EXPECT_EQ(w.decoder(0).bodies(), 2u);
+  Input strike;
+  strike.source = 3;
+  strike.sequence = 1;
+  strike.kind = Input::Kind::kVelocity;
+  strike.body = 1;
+  strike.linear = Vec3(60, 0, 0);
+  ASSERT_TRUE(w.split().region(0).Submit(strike).ok());
+  for (Tick n = 11; n <= 14; ++n) w.Step(n);
+  w.Take(0, &lost);
+  EXPECT_FALSE(w.decoder(0).Contains(1));
+  EXPECT_TRUE(w.decoder(0).Contains(2));
+}
+
+TEST(Replicas, WhoJoinsIsToldOnlyWhatWasCapturedForIt) {
+  World world = OneRegion();
+  for (BodyId id = 1; id <= 40; ++id) {
+    world.bodies.push_back(Ball(id, {8.0 * static_cast<double>(id), 0, 8}, Vec3::Zero()));
+    world.bodies.back().asleep = true;
+  }
+  v1::StreamReplicasRequest one_cell = EveryTick();
+  one_cell.mutable_view()->mutable_box()->mutable_max()->set_x(31);
+  one_cell.mutable_view()->mutable_box()->mutable_max()->set_z(31);
+  Watched w(world, one_cell);
+  w.Step(1);
+  int complete = 0;
+  for (Tick n = 2; n <= 300; ++n) {
+    v1::StreamReplicasRequest all = one_cell;
+    all.mutable_view()->mutable_box()->mutable_max()->set_x(400 + static_cast<double>(n));
+    const auto reader = std::make_shared<Reader>(Read(all, w.tick_us()));
+    w.split().RunTo(n);
+    w.publisher(0).AfterTick(&w.split().region(0));  // captured for one cell
+    w.publisher(0).Join(reader);
+    while (w.publisher(0).published() < n || w.publisher(0).subscribers() < 2) std::this_thread::yield();
+    w.split().RunTo(++n);
+    w.publisher(0).AfterTick(&w.split().region(0));
+    while (w.publisher(0).published() < n) std::this_thread::yield();
+    client::ReplicaDecoder decoder(v1::FINE, false);
+    for (const v1::ReplicaFrame& frame : reader->TakeFrames()) {
+      std::string error;
+      ASSERT_TRUE(decoder.Apply(frame, &error)) << error;
+      if (frame.more()) continue;
+      ++complete;
+      ASSERT_EQ(decoder.bodies(), 40u) << "tick " << frame.tick();
+    }
+    reader->End(grpc::Status::OK);
+    w.publisher(0).Wake();
+    while (w.publisher(0).subscribers() > 1) std::this_thread::yield();
+  }
+  EXPECT_GT(complete, 100);
+}
+
 TEST(Replicas, LargeWorldComesInSeveralFramesAndIsThenComplete) {
   World world = OneRegion();
   for (BodyId id = 1; id <= 60000; ++id) {

@@ -122,6 +122,11 @@ TEST(CellView, WhatCannotBeIsRefusedWithItsField) {
   EXPECT_EQ(Refused(view), "view.frustum.sides");
 }
 
+TEST(CellView, WhatIsBeyondTheLastCellIsInIt) {
+  EXPECT_EQ(CellOf({1e12, 0, -1e12}), (CellKey{kLastCell, -kLastCell - 1}));
+  EXPECT_EQ(CellOf({-1, 0, 32}), (CellKey{-1, 1}));
+}
+
 TEST(DetailLevels, CellsFurtherAwayComeLessOften) {
   v1::LevelOfDetail message;
   message.mutable_eye()->set_x(16);

@@ -53,13 +53,10 @@ TEST(LiveInputs, RepetitionWhileItIsOpenGetsItsOutcomeToo) {
 }
 
 TEST(LiveInputs, OutcomeThatIsNoLongerKeptIsForgottenAndActsNotAgain) {
-  LiveInputs live;
-  ASSERT_TRUE(live.Offer(Kick(1)).ok());
-  RunTick(&live, 1);
-  live.TakeOutcomes();
-  for (uint64_t n = 2; n <= LiveInputs::kKeptOutcomes + 1; ++n) {
+  LiveInputs live({.outcomes = 10});
+  for (uint64_t n = 1; n <= 11; ++n) {
     ASSERT_TRUE(live.Offer(Kick(n)).ok());
-    RunTick(&live, static_cast<Tick>(n), false);
+    RunTick(&live, static_cast<Tick>(n), n == 1);
   }
   live.TakeOutcomes();
   live.TakeDelivered();
@@ -72,6 +69,94 @@ TEST(LiveInputs, OutcomeThatIsNoLongerKeptIsForgottenAndActsNotAgain) {
   EXPECT_EQ(outcomes[1].tick, 2);
   EXPECT_FALSE(outcomes[1].applied());
   EXPECT_TRUE(live.TakeDelivered().empty());
+}
+
+Input SpawnOf(uint64_t client, uint64_t sequence, std::shared_ptr<const Shape> shape) {
+  auto body = std::make_shared<BodySpec>();
+  body->shape = std::move(shape);
+  Input i;
+  i.kind = Input::Kind::kSpawn;
+  i.source = client;
+  i.sequence = sequence;
+  i.spawn = std::move(body);
+  return i;
+}
+
+TEST(LiveInputs, LargeBodiesAreToldOverSeveralTicksAndCopiesCountTheirShapeOnce) {
+  auto large = std::make_shared<Shape>();
+  large->kind = ShapeKind::kCompound;
+  for (int child = 0; child < 64; ++child) {
+    auto hull = std::make_shared<Shape>();
+    hull->kind = ShapeKind::kHull;
+    hull->points.resize(64);
+    large->children.push_back({Vec3::Zero(), Quat::Identity(), hull});
+  }
+  LiveInputs live;
+  for (uint64_t n = 1; n <= 1000; ++n) ASSERT_TRUE(live.Offer(SpawnOf(3, n, large)).ok());
+  EXPECT_EQ(live.TakeOffered().size(), 1000u);
+  for (uint64_t n = 1001; n <= 1040; ++n) {
+    ASSERT_TRUE(live.Offer(SpawnOf(3, n, std::make_shared<Shape>(*large))).ok());
+  }
+  EXPECT_LE(live.TakeOffered().size(), 10u);
+  EXPECT_GE(live.TakeOffered().size(), 1u);
+}
+
+TEST(LiveInputs, InputsOverAreasFillATickSooner) {
+  LiveInputs live;
+  for (uint64_t n = 1; n <= 100; ++n) {
+    Input i = Kick(n);
+    i.body = 0;
+    i.area.radius = 5;
+    ASSERT_TRUE(live.Offer(i).ok());
+  }
+  EXPECT_EQ(live.TakeOffered().size(), 16u);
+}
+
+TEST(LiveInputs, NoMoreBodiesOfClientsThanTheWorldHolds) {
+  LiveInputs live({.bodies = 2});
+  const auto ball = std::make_shared<Shape>();
+  for (uint64_t n = 1; n <= 3; ++n) ASSERT_TRUE(live.Offer(SpawnOf(3, n, ball)).ok());
+  RunTick(&live, 1);
+  std::vector<InputOutcome> outcomes = live.TakeOutcomes();
+  ASSERT_EQ(outcomes.size(), 3u);
+  EXPECT_TRUE(outcomes[0].applied() && outcomes[1].applied());
+  EXPECT_TRUE(outcomes[2].full && !outcomes[2].applied());
+  Input remove = Kick(4);
+  remove.kind = Input::Kind::kRemove;
+  remove.body = outcomes[0].body;
+  ASSERT_TRUE(live.Offer(remove).ok());
+  RunTick(&live, 2);
+  ASSERT_TRUE(live.Offer(SpawnOf(3, 5, ball)).ok());
+  ASSERT_TRUE(live.Offer(SpawnOf(3, 6, ball)).ok());
+  RunTick(&live, 3);
+  outcomes = live.TakeOutcomes();
+  ASSERT_EQ(outcomes.size(), 3u);
+  EXPECT_TRUE(outcomes[1].applied()) << "there is room for one again";
+  EXPECT_TRUE(outcomes[2].full);
+}
+
+TEST(LiveInputs, ClientThatWasSilentForLongestMakesRoomAndOneThatHasSpokenDoesNot) {
+  LiveInputs live({.clients = 2});
+  const auto kick = [](uint64_t client, uint64_t sequence) {
+    Input i = Kick(sequence);
+    i.source = client;
+    return i;
+  };
+  const auto run = [&](const Input& input, Tick n) {
+    EXPECT_TRUE(live.Offer(input).ok());
+    RunTick(&live, n);
+    const std::vector<InputOutcome> outcomes = live.TakeOutcomes();
+    EXPECT_EQ(outcomes.size(), 1u);
+    return outcomes.empty() ? InputOutcome{} : outcomes[0];
+  };
+  const Tick later = LiveInputs::kKeptTicks + 10;
+  EXPECT_TRUE(run(kick(1, 5), 1).applied());
+  EXPECT_TRUE(run(kick(2, 5), 2).applied());
+  EXPECT_TRUE(run(kick(3, 5), 3).full);
+  EXPECT_TRUE(run(kick(1, 6), later).applied());
+  EXPECT_TRUE(run(kick(3, 5), later + 1).applied()) << "in place of client 2";
+  EXPECT_FALSE(run(kick(1, 6), later + 2).full);
+  EXPECT_TRUE(run(kick(2, 6), later + 3).full);
 }
 
 TEST(LiveInputs, OutcomesOfAClientThatIsSilentForLongAreDropped) {

@@ -158,7 +158,7 @@ class Client {
 
   const World& world() const;
 
-  // Begins to watch, or changes what is in view. INVALID_ARGUMENT (3) for values that cannot be.
+  // Begins to watch, or changes what is in view, with the next frames. INVALID_ARGUMENT (3) for values that cannot be.
   Status Watch(const WatchOptions& options);
   // Waits until everything in view is known; false after the timeout.
   bool WaitUntilComplete(double timeout_seconds) const;

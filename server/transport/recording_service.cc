@@ -1,0 +1,179 @@
+#include "server/transport/recording_service.h"
+
+#include <algorithm>
+#include <deque>
+#include <string>
+#include <utility>
+
+#include <absl/strings/str_cat.h>
+#include <grpcpp/server_context.h>
+
+#include "server/transport/error_status.h"
+#include "server/transport/input_codec.h"
+
+namespace aureole {
+namespace {
+
+constexpr Tick kHashEvery = 16;
+
+v1::StateHashes HashesOf(const Region& region) {
+  v1::StateHashes out;
+  out.set_tick(region.tick());
+  out.set_region(region.self());
+  BodyId last = 0;
+  for (BodyId id : region.engine().Ids()) {
+    out.add_body(id - std::exchange(last, id));
+    out.add_hash(region.engine().Hash(id));
+  }
+  return out;
+}
+
+}  // namespace
+
+// One call. Guarded by the service's mutex; deletes itself.
+class RecordingService::Stream final : public grpc::ServerWriteReactor<v1::Recorded> {
+ public:
+  Stream(RecordingService* service, const v1::RecordRequest& request)
+      : service_(service),
+        from_(request.from_tick()),
+        hash_every_(request.hash_every() > 0 ? request.hash_every() : kHashEvery),
+        inputs_(request.inputs()) {}
+
+  Tick from() const { return from_; }
+  bool ended() const { return ended_; }
+  bool WantsHashes(Tick n) const { return !ended_ && n >= from_ && (n == from_ || n % hash_every_ == 0); }
+
+  void AddSnapshot(const v1::Snapshot& snapshot) {
+    const std::string bytes = snapshot.SerializeAsString();
+    for (size_t at = 0; at < bytes.size(); at += kPartBytes) {
+      v1::Recorded& part = queue_.emplace_back();
+      part.set_snapshot_part(bytes.substr(at, kPartBytes));
+      part.set_snapshot_complete(at + kPartBytes >= bytes.size());
+    }
+  }
+
+  // Of a tick after from().
+  void Add(Tick tick, const std::vector<Input>& delivered, const v1::StateHashes* hashes) {
+    if (hashes == nullptr && (!inputs_ || delivered.empty())) return;
+    v1::Recorded& next = queue_.emplace_back();
+    next.set_tick(tick);
+    if (inputs_) {
+      for (const Input& i : delivered) RecordInput(i, next.add_inputs());
+    }
+    if (hashes != nullptr) *next.mutable_hashes() = *hashes;
+    waiting_bytes_ += next.ByteSizeLong();
+    if (waiting_bytes_ > kMostWaiting) {
+      End(Refusal(grpc::StatusCode::RESOURCE_EXHAUSTED, v1::TOO_SLOW, "",
+                  "the reader is 64 MiB behind; read faster, or ask for fewer hashes"));
+    }
+    Continue();
+  }
+
+  void Continue() {
+    if (writing_ || ended_ || queue_.empty()) return;
+    out_ = std::move(queue_.front());
+    queue_.pop_front();
+    if (out_.tick() != 0) waiting_bytes_ -= out_.ByteSizeLong();
+    writing_ = true;
+    StartWrite(&out_);
+  }
+
+  // No further write; finishes now, or when the write in flight is done.
+  void End(const grpc::Status& status) {
+    if (std::exchange(ended_, true)) return;
+    verdict_ = status;
+    queue_.clear();
+    if (!writing_) Finish(verdict_);
+  }
+
+  void OnWriteDone(bool ok) override {
+    const std::lock_guard lock(service_->mutex_);
+    writing_ = false;
+    if (ended_) return Finish(verdict_);
+    if (!ok) return End(grpc::Status::CANCELLED);
+    Continue();
+  }
+  void OnCancel() override {
+    const std::lock_guard lock(service_->mutex_);
+    End(grpc::Status::CANCELLED);
+  }
+  void OnDone() override {
+    {
+      const std::lock_guard lock(service_->mutex_);
+      service_->recorders_ -= static_cast<int>(service_->streams_.erase(this));
+    }
+    delete this;
+  }
+
+ private:
+  RecordingService* const service_;
+  const Tick from_, hash_every_;
+  const bool inputs_;
+  std::deque<v1::Recorded> queue_;
+  size_t waiting_bytes_ = 0;
+  v1::Recorded out_;
+  grpc::Status verdict_;
+  bool writing_ = false, ended_ = false;
+};
+
+grpc::ServerWriteReactor<v1::Recorded>* RecordingService::Record(grpc::CallbackServerContext*,
+                                                                 const v1::RecordRequest* request) {
+  auto* stream = new Stream(this, *request);
+  const std::lock_guard lock(mutex_);
+  // In this order: the tick thread says that a tick is over, then looks who records.
+  streams_.insert(stream);
+  ++recorders_;
+  if (!serving_) {
+    stream->End(NoRegion());
+  } else if (!synchronous_) {
+    stream->End(Refusal(grpc::StatusCode::FAILED_PRECONDITION, v1::BAD_VALUE, "",
+                        "the world's exchange must have no delay; bodies are always under way in one that has"));
+  } else if (request->from_tick() <= tick_) {
+    stream->End(Refusal(grpc::StatusCode::OUT_OF_RANGE, v1::BAD_VALUE, "from_tick",
+                        absl::StrCat("must be to come, and tick ", tick_.load(), " is over; ask for a later one")));
+  } else if (request->hash_every() < 0) {
+    stream->End(Refusal(grpc::StatusCode::INVALID_ARGUMENT, v1::BAD_VALUE, "hash_every", "must not be negative"));
+  }
+  return stream;
+}
+
+void RecordingService::Serve(RegionId region, const v1::WorldSpec& world, bool synchronous) {
+  const std::lock_guard lock(mutex_);
+  serving_ = true;
+  region_ = region;
+  world_ = world;
+  synchronous_ = synchronous;
+}
+
+void RecordingService::Stop() {
+  const std::lock_guard lock(mutex_);
+  serving_ = false;
+  for (Stream* s : streams_) s->End(RegionGivenUp());
+}
+
+void RecordingService::AfterTick(const Region& region, const std::vector<Input>& delivered) {
+  const Tick n = region.tick();
+  tick_ = n;
+  if (recorders_ == 0) return;
+  const std::lock_guard lock(mutex_);
+  const auto any = [this](auto condition) { return std::any_of(streams_.begin(), streams_.end(), condition); };
+  v1::StateHashes hashes;
+  if (any([n](const Stream* s) { return s->WantsHashes(n); })) hashes = HashesOf(region);
+  v1::Snapshot snapshot;
+  if (any([n](const Stream* s) { return !s->ended() && s->from() == n; })) {
+    snapshot.set_region(region_);
+    snapshot.set_tick(n);
+    *snapshot.mutable_world() = world_;
+    RegionSnapshot state = region.Snapshot();
+    snapshot.set_state(std::move(state.state));
+    for (const Input& i : state.to_come) RecordInput(i, snapshot.add_to_come());
+  }
+  for (Stream* s : streams_) {
+    if (s->ended() || s->from() > n) continue;
+    if (s->from() == n) s->AddSnapshot(snapshot);
+    // What was delivered in that tick is to come in the snapshot.
+    s->Add(n, s->from() == n ? std::vector<Input>() : delivered, s->WantsHashes(n) ? &hashes : nullptr);
+  }
+}
+
+}  // namespace aureole
