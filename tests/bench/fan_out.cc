@@ -1,71 +1,20 @@
 #include "tests/bench/fan_out.h"
 
-#include <fcntl.h>
-#include <signal.h>
-#include <spawn.h>
-#include <sys/wait.h>
-#include <unistd.h>
-
 #include <algorithm>
 #include <cstdio>
 #include <filesystem>
 #include <vector>
 
-#include "aureole/v1/world.pb.h"
 #include "server/control/local_allocator.h"
 #include "server/control/run.h"
+#include "tests/bench/load_process.h"
+#include "tests/bench/rolling.h"
 
 namespace aureole {
 namespace {
 
-constexpr int64_t kTickUs = 16'667;       // 60 per second
+constexpr int64_t kTickUs = kRollingTickUs;
 constexpr int64_t kWindowUs = 5'000'000;  // of the reports
-
-// Spheres that roll for ever, in lanes.
-v1::WorldSpec Rolling(int bodies) {
-  v1::WorldSpec spec;
-  spec.set_name("rolling");
-  spec.mutable_tick()->set_nanos(static_cast<int32_t>(kTickUs * 1000));
-  v1::Material& smooth = (*spec.mutable_materials())["default"];
-  smooth.set_friction(0.5);
-  smooth.set_angular_damping(0);
-  spec.mutable_sleeping()->set_linear(0);
-  spec.mutable_sleeping()->set_angular(0);
-  spec.add_statics()->mutable_shape()->mutable_plane()->mutable_normal()->set_y(1);
-  for (int i = 0; i < bodies; ++i) {
-    v1::Body* b = spec.add_bodies();
-    b->mutable_shape()->mutable_sphere()->set_radius(0.5);
-    b->set_mass(1);
-    b->mutable_position()->set_x(i % 25 * 4 - 50);
-    b->mutable_position()->set_y(0.5);
-    b->mutable_position()->set_z(i / 25 * 2 - 40);
-    b->mutable_velocity()->set_x(i / 25 % 2 == 0 ? 1.5 : -1.5);
-  }
-  return spec;
-}
-
-// `aureole load` while it lives.
-class Load {
- public:
-  Load(const std::string& program, const std::string& server, int clients) {
-    const std::string n = std::to_string(clients);
-    const char* arguments[] = {program.c_str(), "load",       "--server", server.c_str(), "--clients",
-                               n.c_str(),       "--duration", "3600s",    nullptr};
-    posix_spawn_file_actions_t files;
-    posix_spawn_file_actions_init(&files);
-    posix_spawn_file_actions_addopen(&files, 1, "/dev/null", O_WRONLY, 0);
-    if (posix_spawn(&pid_, program.c_str(), &files, nullptr, const_cast<char**>(arguments), environ) != 0) pid_ = -1;
-    posix_spawn_file_actions_destroy(&files);
-  }
-  ~Load() {
-    if (pid_ <= 0) return;
-    kill(pid_, SIGINT);
-    waitpid(pid_, nullptr, 0);
-  }
-
- private:
-  pid_t pid_ = -1;
-};
 
 double Median(std::vector<double> v) {
   if (v.empty()) return 0;
@@ -85,7 +34,7 @@ FanOutResult MeasureFanOut(const FanOutOptions& options) {
   run.last_tick = windows * kWindowUs / kTickUs;
   LocalAllocator allocator({});
   RunResult result;
-  std::unique_ptr<Load> load;
+  std::unique_ptr<LoadProcess> load;
   const absl::Status end = RunWorld(
       run, allocator,
       [&](const RunStatus& status) {
@@ -93,7 +42,7 @@ FanOutResult MeasureFanOut(const FanOutOptions& options) {
         const int64_t window = status.MinTick() * kTickUs / kWindowUs;
         const bool wanted = status.stage == Stage::kRunning && window > 0 && (window - 1) / 2 % 2 == 1;
         if (wanted && load == nullptr)
-          load = std::make_unique<Load>(program, status.regions[0].endpoint, options.clients);
+          load = std::make_unique<LoadProcess>(program, status.regions[0].endpoint, options.clients, "3600s");
         if (!wanted) load.reset();
         return true;
       },

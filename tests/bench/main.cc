@@ -7,6 +7,8 @@
 #include "tests/bench/client_bytes.h"
 #include "tests/bench/fan_out.h"
 #include "tests/bench/overhead.h"
+#include "tests/bench/stopped_clients.h"
+#include "tests/bench/view_cost.h"
 
 namespace aureole {
 namespace {
@@ -60,6 +62,29 @@ int PrintFanOut(const FanOutOptions& options, bool json) {
   return 0;
 }
 
+int PrintStopped(const StoppedClientsOptions& options, bool json) {
+  const StoppedClientsResult r = MeasureStoppedClients(options);
+  if (!r.ok) return 1;
+  std::printf(
+      json ? "{\"clients\": %d, \"stopped\": %d, \"rate_before\": %.2f, \"rate_after\": %.2f, "
+             "\"p99_before_ms\": %.2f, \"p99_after_ms\": %.2f, \"memory_before_mb\": %.1f, "
+             "\"memory_after_mb\": %.1f}\n"
+           : "%d clients, %d of them stopped: the slowest of the others gets %.1f frames/s before and %.1f after, "
+             "p99 between frames %.1f and %.1f ms; memory of the server %.1f and %.1f MB\n",
+      options.clients, options.stopped, r.rate_before, r.rate_after, r.p99_before_ms, r.p99_after_ms,
+      r.memory_before_mb, r.memory_after_mb);
+  return 0;
+}
+
+void PrintViewCost(const ViewCostOptions& options, bool json) {
+  const ViewCostResult r = MeasureViewCost(options);
+  std::printf(json ? "{\"bodies\": %d, \"in_view\": %d, \"large_us\": %.1f, \"small_us\": %.1f, \"ratio\": %.3f, "
+                     "\"distinct_us\": %.1f}\n"
+                   : "of %d moving bodies %d are in view: %.0f us of CPU per frame; in a world of these alone %.0f us: "
+                     "ratio %.2f\none more view of its own: %.0f us per frame\n",
+              options.bodies, r.in_view, r.large_us, r.small_us, r.ratio, r.distinct_us);
+}
+
 int Run(int argc, char** argv) {
   CLI::App app("Benchmarks of Aureole.");
   app.require_subcommand(1);
@@ -84,9 +109,21 @@ int Run(int argc, char** argv) {
   fan_out->add_option("--bodies", fan_out_options.bodies, "Bodies in view")->check(CLI::Range(1, 100000));
   fan_out->add_option("--blocks", fan_out_options.blocks, "Blocks of 10 s with and without clients")
       ->check(CLI::Range(1, 1000));
+  StoppedClientsOptions stopped_options;
+  CLI::App* stopped = app.add_subcommand("stopped", "Clients that stop reading, beside others, on real processes.");
+  stopped->add_flag("--json", json, "One JSON object instead of text");
+  stopped->add_option("--clients", stopped_options.clients, "Clients")->check(CLI::Range(2, 10000));
+  stopped->add_option("--stopped", stopped_options.stopped, "Clients that stop")->check(CLI::Range(1, 9999));
+  ViewCostOptions view_options;
+  CLI::App* view = app.add_subcommand("view", "A view of a small part of a large world, and views of their own.");
+  view->add_flag("--json", json, "One JSON object instead of text");
+  view->add_option("--bodies", view_options.bodies, "Bodies of the large world")->check(CLI::Range(2000, 1000000));
+  view->add_option("--frames", view_options.frames, "Measured frames")->check(CLI::Range(4, 100000));
   CLI11_PARSE(app, argc, argv);
   if (overhead->parsed()) PrintOverhead(overhead_options, json);
   if (bytes->parsed()) PrintClientBytes(bytes_options, json);
+  if (view->parsed()) PrintViewCost(view_options, json);
+  if (stopped->parsed()) return PrintStopped(stopped_options, json);
   if (fan_out->parsed()) return PrintFanOut(fan_out_options, json);
   return 0;
 }
