@@ -155,7 +155,7 @@ void Client::Impl::OnFrame(int32_t region, const v1::ReplicaFrame& frame, const 
     uint64_t id = 0;
     for (uint64_t step : d.body()) looks[id += step] = look;
   }
-  merger.Apply(region, decoder);
+  merger.Apply(region, decoder, frame.more());
   std::vector<LostBody> lost = merger.lost();
   Stream& stream = streams[static_cast<size_t>(region)];
   stream.tick = decoder.tick();

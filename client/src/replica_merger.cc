@@ -4,10 +4,10 @@
 
 namespace aureole::client {
 
-void ReplicaMerger::Apply(int32_t region, const ReplicaDecoder& decoder) {
+void ReplicaMerger::Apply(int32_t region, const ReplicaDecoder& decoder, bool more) {
   lost_.clear();
   for (uint64_t id : decoder.changed()) {
-    if (!decoder.Contains(id)) continue;
+    if (!decoder.Contains(id) || removed_.contains(id)) continue;
     const ToldBody told = decoder.Get(id);
     const auto [it, fresh] = bodies_.try_emplace(id);
     MergedBody& body = it->second;
@@ -25,6 +25,7 @@ void ReplicaMerger::Apply(int32_t region, const ReplicaDecoder& decoder) {
   }
   for (const LostBody& l : decoder.lost()) {
     const auto it = bodies_.find(l.body);
+    if (l.why == LostBody::Why::kRemoved) removed_[l.body] = decoder.tick();
     if (it == bodies_.end()) continue;
     if (l.why == LostBody::Why::kMoved) {
       Transit& t = transits_[l.body];
@@ -35,7 +36,15 @@ void ReplicaMerger::Apply(int32_t region, const ReplicaDecoder& decoder) {
     }
   }
   ticks_[region] = decoder.tick();
-  Settle(region, decoder);
+  if (!more) Settle(region, decoder);
+  ForgetRemoved();
+}
+
+void ReplicaMerger::ForgetRemoved() {
+  if (removed_.empty()) return;
+  int64_t oldest = ticks_.begin()->second;
+  for (const auto& [region, tick] : ticks_) oldest = std::min(oldest, tick);
+  std::erase_if(removed_, [oldest](const auto& e) { return e.second < oldest; });
 }
 
 // Bodies that should be here by now.

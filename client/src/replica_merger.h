@@ -25,8 +25,8 @@ struct MergedBody {
 
 class ReplicaMerger {
  public:
-  // After `decoder`, of this region's stream, has taken a frame.
-  void Apply(int32_t region, const ReplicaDecoder& decoder);
+  // After `decoder`, of this region's stream, has taken a frame. `more`: that frame did not hold all that is in view.
+  void Apply(int32_t region, const ReplicaDecoder& decoder, bool more = false);
   // After a new stream to this region has told all that is in view: what the old one told and the new one does not have
   // is gone.
   void Reconcile(int32_t region, const ReplicaDecoder& decoder);
@@ -44,10 +44,13 @@ class ReplicaMerger {
   };
   void Settle(int32_t region, const ReplicaDecoder& decoder);
   void Lose(const LostBody& lost);
+  void ForgetRemoved();
 
   std::unordered_map<uint64_t, MergedBody> bodies_;
   std::unordered_map<uint64_t, Transit> transits_;
   std::unordered_map<int32_t, int64_t> ticks_;  // of each region's last frame
+  // Bodies that were removed, and when: a frame of another region that comes late may still tell of them.
+  std::unordered_map<uint64_t, int64_t> removed_;
   std::vector<LostBody> lost_;
 };
 

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <limits>
+#include <tuple>
 #include <utility>
 
 namespace aureole {
@@ -14,6 +15,8 @@ constexpr size_t kQueryCost = 16;
 bool ById(const BodyPose& x, const BodyPose& y) { return x.id < y.id; }
 
 void SortUnique(std::vector<BodyPose>* poses) {
+  const auto ascend = [](const BodyPose& x, const BodyPose& y) { return x.id >= y.id; };
+  if (std::adjacent_find(poses->begin(), poses->end(), ascend) == poses->end()) return;
   std::sort(poses->begin(), poses->end(), ById);
   poses->erase(std::unique(poses->begin(), poses->end(), [](const auto& x, const auto& y) { return x.id == y.id; }),
                poses->end());
@@ -35,6 +38,34 @@ std::vector<CellKey> NewCells(const Watch& now, const Watch* before) {
 }
 
 }  // namespace
+
+std::vector<CellRect> RectsOf(std::vector<CellKey> cells) {
+  // Runs along x, then runs of equal ones along z.
+  std::sort(cells.begin(), cells.end(),
+            [](const CellKey& a, const CellKey& b) { return a.z != b.z ? a.z < b.z : a.x < b.x; });
+  std::vector<CellRect> runs;
+  for (const CellKey& c : cells) {
+    if (!runs.empty() && runs.back().high.z == c.z && runs.back().high.x == c.x - 1) {
+      runs.back().high.x = c.x;
+    } else {
+      runs.push_back({c, c});
+    }
+  }
+  std::sort(runs.begin(), runs.end(), [](const CellRect& a, const CellRect& b) {
+    return std::tie(a.low.x, a.high.x, a.low.z) < std::tie(b.low.x, b.high.x, b.low.z);
+  });
+  std::vector<CellRect> out;
+  for (const CellRect& r : runs) {
+    const bool grows = !out.empty() && out.back().low.x == r.low.x && out.back().high.x == r.high.x &&
+                       out.back().high.z == r.low.z - 1;
+    if (grows) {
+      out.back().high.z = r.high.z;
+    } else {
+      out.push_back(r);
+    }
+  }
+  return out;
+}
 
 bool ReplicaCapture::Due(const Watch& watch, Tick n) const {
   return std::any_of(watch.periods.begin(), watch.periods.end(), [n](Tick period) { return n % period == 0; });
@@ -59,16 +90,16 @@ void ReplicaCapture::Take(Region* region, std::shared_ptr<const Watch> watch, Ca
   if (watch->everything && (out->first || !watch_->everything)) {
     engine.AppendPoses({Vec3::Constant(-kInf), Vec3::Constant(kInf)}, &poses);
   } else if (!watch->everything) {
-    TakeCells(engine, NewCells(*watch, watch_.get()), &poses);
+    TakeRects(engine, RectsOf(NewCells(*watch, watch_.get())), &poses);
   }
   std::vector<BodyId> fresh = changes.came;
   for (const BodyPose& p : poses) fresh.push_back(p.id);
 
   // What moves.
   const bool few = !watch->everything &&
-                   2 * last_.size() + kQueryCost * watch->cells.size() < static_cast<size_t>(engine.CountAwake());
+                   2 * last_.size() + kQueryCost * watch->rects.size() < static_cast<size_t>(engine.CountAwake());
   if (few) {
-    TakeCells(engine, {watch->cells.begin(), watch->cells.end()}, &poses);
+    TakeRects(engine, watch->rects, &poses);
   } else {
     TakeAwake(engine, *watch, &poses);
   }
@@ -118,16 +149,17 @@ void ReplicaCapture::TakeAwake(const Engine& engine, const Watch& watch, std::ve
              out->end());
 }
 
-void ReplicaCapture::TakeCells(const Engine& engine, const std::vector<CellKey>& cells,
+void ReplicaCapture::TakeRects(const Engine& engine, const std::vector<CellRect>& rects,
                                std::vector<BodyPose>* out) const {
-  for (const CellKey& c : cells) {
+  const auto low = [](int32_t cell) { return cell > -kLastCell - 1 ? cell * kCellSize : -kInf; };
+  const auto high = [](int32_t cell) { return cell < kLastCell ? (cell + 1) * kCellSize : kInf; };
+  for (const CellRect& r : rects) {
     const auto first = static_cast<std::ptrdiff_t>(out->size());
-    const auto low = [](int32_t cell) { return cell > -kLastCell - 1 ? cell * kCellSize : -kInf; };
-    const auto high = [](int32_t cell) { return cell < kLastCell ? (cell + 1) * kCellSize : kInf; };
-    engine.AppendPoses({Vec3(low(c.x), -kInf, low(c.z)), Vec3(high(c.x), kInf, high(c.z))}, out);
-    out->erase(
-        std::remove_if(out->begin() + first, out->end(), [&c](const BodyPose& p) { return CellOf(p.position) != c; }),
-        out->end());
+    engine.AppendPoses({Vec3(low(r.low.x), -kInf, low(r.low.z)), Vec3(high(r.high.x), kInf, high(r.high.z))}, out);
+    // Boxes that reach in from outside.
+    out->erase(std::remove_if(out->begin() + first, out->end(),
+                              [&r](const BodyPose& p) { return !r.Contains(CellOf(p.position)); }),
+               out->end());
   }
 }
 

@@ -13,12 +13,21 @@
 
 namespace aureole {
 
+// Cells from `low` to `high` in x and in z, both included.
+struct CellRect {
+  CellKey low, high;
+  bool Contains(const CellKey& c) const { return c.x >= low.x && c.x <= high.x && c.z >= low.z && c.z <= high.z; }
+};
+// Few rectangles that cover these cells, each once, and nothing else. Cost: n log n.
+std::vector<CellRect> RectsOf(std::vector<CellKey> cells);
+
 // What is watched, and when. Immutable.
 struct Watch {
   uint64_t generation = 0;    // grows with every watch
   std::vector<Tick> periods;  // captures are due at multiples of any
   bool everything = false;    // else the cells
   absl::flat_hash_set<CellKey> cells;
+  std::vector<CellRect> rects;  // of the cells
 
   bool Contains(const CellKey& cell) const { return everything || cells.contains(cell); }
 };
@@ -50,7 +59,7 @@ class ReplicaCapture {
 
  private:
   void TakeAwake(const Engine& engine, const Watch& watch, std::vector<BodyPose>* out) const;
-  void TakeCells(const Engine& engine, const std::vector<CellKey>& cells, std::vector<BodyPose>* out) const;
+  void TakeRects(const Engine& engine, const std::vector<CellRect>& rects, std::vector<BodyPose>* out) const;
 
   std::shared_ptr<const Watch> watch_;  // of the capture before; null: none
   std::vector<BodyId> last_;            // captured then in watched cells, but for those at rest; ascending

@@ -200,6 +200,7 @@ void ReplicaPublisher::ChooseWatch() {
       watch->cells.insert(r.cells->begin(), r.cells->end());
     }
   }
+  if (watch != nullptr) watch->rects = RectsOf({watch->cells.begin(), watch->cells.end()});
   subscribers_ = subscribers;
   const std::lock_guard lock(mutex_);
   watched_ = watch != nullptr;

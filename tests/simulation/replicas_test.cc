@@ -126,7 +126,7 @@ class Watched {
         uint64_t id = 0;
         for (uint64_t step : d.body()) described_.insert(id += step);
       }
-      merger_.Apply(r, decoder(r));
+      merger_.Apply(r, decoder(r), frame.more());
       lost->insert(lost->end(), merger_.lost().begin(), merger_.lost().end());
     }
   }

@@ -3,7 +3,11 @@
 
 #include <gtest/gtest.h>
 
+#include <algorithm>
 #include <cmath>
+#include <vector>
+
+#include "server/transport/replica_capture.h"
 
 namespace aureole {
 namespace {
@@ -120,6 +124,19 @@ TEST(CellView, WhatCannotBeIsRefusedWithItsField) {
   EXPECT_EQ(Refused(view), "view.frustum.sides[0].normal");
   for (int i = 0; i < 9; ++i) AddSide(1, 0, 0, 1, &view);
   EXPECT_EQ(Refused(view), "view.frustum.sides");
+}
+
+TEST(CellView, RectanglesCoverTheCellsOnce) {
+  const std::vector<CellKey> cells{{0, 0}, {1, 0}, {0, 1}, {1, 1}, {1, 2}, {-3, 1}};
+  const std::vector<CellRect> rects = RectsOf(cells);
+  EXPECT_LE(rects.size(), 3u);
+  for (int x = -5; x < 5; ++x) {
+    for (int z = -5; z < 5; ++z) {
+      const CellKey c{x, z};
+      const auto holds = std::count_if(rects.begin(), rects.end(), [&](const CellRect& r) { return r.Contains(c); });
+      EXPECT_EQ(holds, std::count(cells.begin(), cells.end(), c)) << x << ' ' << z;
+    }
+  }
 }
 
 TEST(CellView, WhatIsBeyondTheLastCellIsInIt) {
