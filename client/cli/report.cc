@@ -75,8 +75,8 @@ class Report {
     for (const auto& [region, points] : factor_) out.back().series.push_back({RegionName(region), points});
     out.push_back({"Transfers", "simulated time, s", "since the start, all regions", step, {}});
     out.back().series.push_back({"transfers", SumOver(transfers_)});
-    out.push_back({"Energy, of the motion of centres and of height", "simulated time, s", "kJ", step, {}});
-    Series motion{"motion", {}}, height{"height, above the least", {}}, both{"sum", {}};
+    out.push_back({"Energy: motion of the centres; height above the least", "simulated time, s", "kJ", step, {}});
+    Series motion{"motion", {}}, height{"height", {}}, both{"sum", {}};
     double least = std::numeric_limits<double>::infinity();
     for (const auto& [tick, e] : energies_) {
       if (Whole(e)) least = std::min(least, e.height);

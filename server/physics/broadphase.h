@@ -28,22 +28,39 @@ class Broadphase {
   // Keeps the trees shallow; once a tick.
   void Rebalance();
 
-  // Calls fn(Body*) for every dynamic body whose exact box meets the box, in no particular order.
+  // Calls fn(Body*) for every dynamic body whose exact box meets the box, in no particular order. In a large world
+  // nodes and bodies are far from the processor, so they are asked for before they are needed. `fn` must not query.
   template <class Fn>
   void Query(const btVector3& low, const btVector3& high, Fn&& fn) const {
-    struct Hits : btDbvt::ICollide {
-      Hits(const btVector3& l, const btVector3& h, Fn& f) : low(l), high(h), call(f) {}
-      void Process(const btDbvtNode* leaf) override {
-        Body* b = static_cast<Body*>(leaf->data);
-        if (b->low.x() <= high.x() && low.x() <= b->high.x() && b->low.y() <= high.y() && low.y() <= b->high.y() &&
-            b->low.z() <= high.z() && low.z() <= b->high.z()) {
-          call(b);
+    if (moving_.m_root == nullptr) return;
+    const btDbvtVolume box = btDbvtVolume::FromMM(low, high);
+    std::vector<const btDbvtNode*>& open = open_nodes_;
+    std::vector<Body*>& found = found_bodies_;
+    open.assign(1, moving_.m_root);
+    found.clear();
+    while (!open.empty()) {
+      const btDbvtNode* node = open.back();
+      open.pop_back();
+      if (!Intersect(node->volume, box)) continue;
+      if (node->isinternal()) {
+        for (const btDbvtNode* child : {node->childs[0], node->childs[1]}) {
+          __builtin_prefetch(child);
+          __builtin_prefetch(reinterpret_cast<const char*>(child) + sizeof(*child) - 1);
+          open.push_back(child);
         }
+      } else {
+        found.push_back(static_cast<Body*>(node->data));
+        __builtin_prefetch(&found.back()->id);
+        __builtin_prefetch(&found.back()->low);
+        __builtin_prefetch(&found.back()->high);
       }
-      const btVector3 &low, &high;
-      Fn& call;
-    } hits(low, high, fn);
-    moving_.collideTV(moving_.m_root, btDbvtVolume::FromMM(low, high), hits);
+    }
+    for (Body* b : found) {
+      if (b->low.x() <= high.x() && low.x() <= b->high.x() && b->low.y() <= high.y() && low.y() <= b->high.y() &&
+          b->low.z() <= high.z() && low.z() <= b->high.z()) {
+        fn(b);
+      }
+    }
   }
 
   // Calls fn(Body*) for every body, fixed ones too, whose fat box meets the line, in no particular order.
@@ -69,6 +86,8 @@ class Broadphase {
   std::deque<Pair> pool_;
   std::vector<Pair*> free_;
   std::vector<Body*> moved_, close_;
+  mutable std::vector<const btDbvtNode*> open_nodes_;  // of Query
+  mutable std::vector<Body*> found_bodies_;            // likewise
 };
 
 }  // namespace aureole::physics

@@ -28,6 +28,16 @@ btVector3 Lever(const Input& input, const btRigidBody& rigid) {
   return btVector3(0, 0, 0);
 }
 
+void PrefetchPose(const Body& body) {
+  const btTransform& at = body.rigid.getWorldTransform();
+  __builtin_prefetch(&at);
+  __builtin_prefetch(&at.getBasis()[2]);
+  __builtin_prefetch(&at.getOrigin());
+  __builtin_prefetch(&body.rigid.getLinearVelocity());
+  __builtin_prefetch(&body.rigid.getAngularVelocity());
+  __builtin_prefetch(&body.asleep);
+}
+
 BodyPose PoseOf(const Body& body) {
   const btTransform& at = body.rigid.getWorldTransform();
   const btQuaternion turn = at.getRotation();
@@ -162,9 +172,14 @@ void BulletEngine::AppendAwake(std::vector<BodyPose>* out) const {
 }
 
 void BulletEngine::AppendPoses(const Box& box, std::vector<BodyPose>* out) const {
-  const auto first = static_cast<std::ptrdiff_t>(out->size());
-  world_.broadphase().Query(ToBullet(box.min), ToBullet(box.max), [out](const Body* b) { out->push_back(PoseOf(*b)); });
-  std::sort(out->begin() + first, out->end(), ById);
+  std::vector<const Body*> found;
+  world_.broadphase().Query(ToBullet(box.min), ToBullet(box.max), [&found](const Body* b) { found.push_back(b); });
+  std::sort(found.begin(), found.end(), [](const Body* x, const Body* y) { return x->id < y->id; });
+  constexpr size_t kAhead = 4;
+  for (size_t i = 0; i < found.size(); ++i) {
+    if (i + kAhead < found.size()) PrefetchPose(*found[i + kAhead]);
+    out->push_back(PoseOf(*found[i]));
+  }
 }
 
 std::optional<RayHit> BulletEngine::CastRay(const Vec3& from, const Vec3& to) const {

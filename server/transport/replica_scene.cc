@@ -53,7 +53,10 @@ void ReplicaScene::Apply(const Capture& capture) {
     body.epoch = f.epoch;
     body.look = Describe(f.look);
   }
-  for (const BodyPose& pose : capture.poses) {
+  constexpr size_t kAhead = 8;  // in a large world they are far from the processor
+  for (size_t i = 0; i < capture.poses.size(); ++i) {
+    if (i + kAhead < capture.poses.size()) bodies_.prefetch(capture.poses[i + kAhead].id);
+    const BodyPose& pose = capture.poses[i];
     const auto it = bodies_.find(pose.id);
     if (it == bodies_.end()) continue;  // it left what is watched before this
     const CellKey cell = CellOf(pose.position);

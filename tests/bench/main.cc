@@ -78,11 +78,12 @@ int PrintStopped(const StoppedClientsOptions& options, bool json) {
 
 void PrintViewCost(const ViewCostOptions& options, bool json) {
   const ViewCostResult r = MeasureViewCost(options);
-  std::printf(json ? "{\"bodies\": %d, \"in_view\": %d, \"large_us\": %.1f, \"small_us\": %.1f, \"ratio\": %.3f, "
-                     "\"distinct_us\": %.1f}\n"
-                   : "of %d moving bodies %d are in view: %.0f us of CPU per frame; in a world of these alone %.0f us: "
-                     "ratio %.2f\none more view of its own: %.0f us per frame\n",
-              options.bodies, r.in_view, r.large_us, r.small_us, r.ratio, r.distinct_us);
+  std::printf(json ? "{\"bodies\": %d, \"in_view\": %d, \"large_us\": %.1f, \"large_tick_us\": %.1f, \"small_us\": "
+                     "%.1f, \"small_tick_us\": %.1f, \"ratio\": %.3f, \"distinct_us\": %.1f}\n"
+                   : "of %d moving bodies %d are in view: %.0f us of CPU per frame (tick thread: %.0f); in a world of "
+                     "these alone %.0f us (%.0f): ratio %.2f\none more view of its own: %.0f us per frame\n",
+              options.bodies, r.in_view, r.large_us, r.large_tick_us, r.small_us, r.small_tick_us, r.ratio,
+              r.distinct_us);
 }
 
 int Run(int argc, char** argv) {

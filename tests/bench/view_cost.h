@@ -12,8 +12,9 @@ struct ViewCostOptions {
 };
 
 struct ViewCostResult {
-  double large_us = 0, small_us = 0;  // CPU per frame, medians
-  double ratio = 0;                   // of these
+  double large_us = 0, small_us = 0;            // CPU per frame, medians
+  double large_tick_us = 0, small_tick_us = 0;  // of it, that of the tick thread
+  double ratio = 0;                             // of these
   int in_view = 0;
   // What one more view of its own costs per frame in the large world.
   double distinct_us = 0;

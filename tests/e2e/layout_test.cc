@@ -3,6 +3,7 @@
 #include <gmock/gmock.h>
 #include <gtest/gtest.h>
 
+#include <grpcpp/generic/generic_stub.h>
 #include <grpcpp/grpcpp.h>
 
 #include <chrono>
@@ -146,6 +147,46 @@ TEST(Layout, SceneTellsWhatIsFixedWithItsScripts) {
     v1::GetWorldResponse plain;
     ASSERT_TRUE(Connect(endpoints[0])->GetWorld(&context, {}, &plain).ok());
     EXPECT_EQ(plain.scene_size(), 0);
+  });
+}
+
+// What a gRPC server answers to the reflection's request to list its services.
+std::string ListServices(const std::string& endpoint) {
+  grpc::GenericStub stub(grpc::CreateChannel(endpoint, grpc::InsecureChannelCredentials()));
+  grpc::ClientContext context;
+  SetDeadline(&context);
+  grpc::CompletionQueue queue;
+  const auto call =
+      stub.PrepareCall(&context, "/grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo", &queue);
+  const auto wait = [&queue] {
+    void* tag = nullptr;
+    bool ok = false;
+    return queue.Next(&tag, &ok) && ok;
+  };
+  call->StartCall(nullptr);
+  if (!wait()) return "";
+  const grpc::Slice request("\x3a\x01*", 3);  // list_services = "*"
+  call->WriteLast(grpc::ByteBuffer(&request, 1), {}, nullptr);
+  if (!wait()) return "";
+  grpc::ByteBuffer response;
+  call->Read(&response, nullptr);
+  if (!wait()) return "";
+  grpc::Slice bytes;
+  response.DumpToSingleSlice(&bytes);
+  grpc::Status status;
+  context.TryCancel();
+  call->Finish(&status, nullptr);
+  wait();
+  return std::string(bytes.begin(), bytes.end());
+}
+
+TEST(Layout, ReflectionListsEveryService) {
+  PlayIn(Sliding(), 2, [](const std::vector<std::string>& endpoints) {
+    const std::string services = ListServices(endpoints[1]);
+    for (const char* service :
+         {"aureole.v1.Simulation", "aureole.v1.Recording", "aureole.v1.Peer", "grpc.health.v1.Health"}) {
+      EXPECT_NE(services.find(service), std::string::npos) << service;
+    }
   });
 }
 
