@@ -105,7 +105,11 @@ class Doctor {
     const double tick_ms = static_cast<double>(world.tick_us()) * 1e-3;
     for (size_t r = 0; r < status.regions.size(); ++r) {
       const RegionStatus& region = status.regions[r];
-      if (region.left || region.report.tick() == 0) continue;  // told above
+      if (region.left || region.report.tick() == 0) {
+        Say(Level::kFailure, absl::StrFormat("region %d does not tell its status %s", r, region.goodbye),
+            "its tick stands still, or it is gone: see its log");
+        continue;
+      }
       const double factor = region.report.real_time_factor(), p99 = region.frame.p99_ms();
       if (factor < 0.95) {
         Say(Level::kWarning, absl::StrFormat("region %d runs at %.2f of real time", r, factor),

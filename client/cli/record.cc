@@ -24,6 +24,7 @@
 #include "client/cli/mcap_writer.h"
 #include "client/cli/recording.h"
 #include "server/control/interrupts.h"
+#include "server/replay/replay.h"
 
 namespace aureole {
 namespace {
@@ -72,13 +73,15 @@ class Recorder {
     }
   }
 
-  // Ends all streams and waits for their threads.
-  void Stop() {
+  // Ends all streams. Start, too, returns then.
+  void Cancel() {
+    const std::lock_guard lock(mutex_);
     stopping_ = true;
-    {
-      const std::lock_guard lock(mutex_);
-      for (grpc::ClientContext* c : contexts_) c->TryCancel();
-    }
+    for (grpc::ClientContext* c : contexts_) c->TryCancel();
+  }
+  // And waits for their threads.
+  void Stop() {
+    Cancel();
     for (std::thread& t : threads_) t.join();
     threads_.clear();
   }
@@ -139,6 +142,7 @@ class Recorder {
     auto out = std::make_shared<grpc::ClientContext>();
     const std::lock_guard lock(mutex_);
     contexts_.push_back(out.get());
+    if (stopping_) out->TryCancel();
     return out;
   }
 
@@ -197,12 +201,14 @@ class Recorder {
     snapshot->append(message.snapshot_part());
     if (message.snapshot_complete()) {
       v1::Snapshot whole;
-      whole.ParseFromString(*snapshot);
+      if (!whole.ParseFromString(*snapshot)) return Fail(absl::StrCat("region ", region, " told no snapshot"));
       *snapshot = {};
       Write(RegionTopic(region, "snapshot"), whole, whole.tick());
       Flush();
     }
-    for (const v1::Input& i : message.inputs()) {
+    google::protobuf::RepeatedPtrField<v1::Input> inputs = message.inputs();
+    ExpandShapes(&inputs);
+    for (const v1::Input& i : inputs) {
       Write(kInputsTopic, i, i.tick());
       ++inputs_;
     }
@@ -287,7 +293,17 @@ int RunRecord(const RecordOptions& o) {
     return kExitBadInput;
   }
   Recorder recorder(o, *std::move(file), std::move(world));
-  if (const grpc::Status s = recorder.Start(); !s.ok()) {
+  // A world that stands still never comes to the tick at which it would begin.
+  std::atomic<bool> started = false;
+  std::thread interrupter([&] {
+    while (!started && Interrupts() == 0) std::this_thread::sleep_for(std::chrono::milliseconds(20));
+    if (!started) recorder.Cancel();
+  });
+  const grpc::Status begun = recorder.Start();
+  started = true;
+  interrupter.join();
+  if (Interrupts() > 0) return kExitInterrupted;
+  if (const grpc::Status& s = begun; !s.ok()) {
     std::cerr << "aureole: cannot record: " << s.error_message() << '\n';
     return kExitFailed;
   }

@@ -50,7 +50,7 @@ int RunReplay(const ReplayOptions& o) {
   if (!begun.ok()) return Refuse(begun.status());
   Replay& replay = **begun;
   if (!recorded->whole) std::cerr << "aureole: " << o.file << " was cut off; what is there is replayed\n";
-  // Each acts once, though the snapshot may know it already.
+  // The servers tell none that the snapshots have.
   for (const v1::Input& input : recorded->inputs) {
     if (absl::Status s = replay.Add(input); !s.ok()) return Refuse(s);
   }

@@ -73,9 +73,11 @@ class Display {
       }
     }
     if (process_ == nullptr) return;
+    // Its address, or why there is none.
     const std::string said = process_->TakeLines();
-    const size_t end = said.find('\n');
-    if (end != std::string::npos) viewer_says_ = said.substr(0, end);
+    const size_t begin = said.find("viewer: "), from = begin == std::string::npos ? 0 : begin;
+    const size_t end = said.find('\n', from);
+    if (end != std::string::npos) viewer_says_ = said.substr(from, end - from);
   }
 
   const Heading heading_;

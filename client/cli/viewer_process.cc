@@ -20,7 +20,10 @@ absl::StatusOr<std::unique_ptr<ViewerProcess>> ViewerProcess::Start(const std::s
     return absl::UnavailableError(absl::StrCat("--viewer: there is no ", gateway));
   }
   int in[2], out[2];
-  if (pipe2(in, O_CLOEXEC) != 0 || pipe2(out, O_CLOEXEC) != 0) {
+  if (pipe2(in, O_CLOEXEC) != 0) return absl::UnavailableError(absl::StrCat("pipe: ", std::strerror(errno)));
+  if (pipe2(out, O_CLOEXEC) != 0) {
+    close(in[0]);
+    close(in[1]);
     return absl::UnavailableError(absl::StrCat("pipe: ", std::strerror(errno)));
   }
   const char* arguments[] = {"node", gateway.c_str(), "--server", server.c_str(), "--exit-with-stdin", nullptr};
@@ -47,9 +50,12 @@ ViewerProcess::~ViewerProcess() {
   close(in_);
   kill(pid_, SIGTERM);
   // It has nothing to save.
-  for (int i = 0; i < 200 && waitpid(pid_, nullptr, WNOHANG) == 0; ++i) usleep(10'000);
-  kill(pid_, SIGKILL);
-  waitpid(pid_, nullptr, 0);
+  bool runs = true;
+  for (int i = 0; i < 200 && (runs = waitpid(pid_, nullptr, WNOHANG) == 0); ++i) usleep(10'000);
+  if (runs) {
+    kill(pid_, SIGKILL);
+    waitpid(pid_, nullptr, 0);
+  }
   close(out_);
 }
 

@@ -104,7 +104,7 @@ void LiveInputs::Deliver(const std::vector<Input>& inputs, Tick effect, Tick spa
     open.mine = mine ? 1 : 0;
     open.over_area = told.over_area();
     open.removes_live = told.kind == Input::Kind::kRemove && IsLiveId(told.body);
-    open.full = spawn && bodies_ >= limits_.bodies;
+    open.full = spawn ? bodies_ >= limits_.bodies : !TakeLasting(told, tick);
     effect_[name] = tick;
     if (open.full) continue;
     Input input = told;
@@ -133,6 +133,19 @@ LiveInputs::Source* LiveInputs::Find(uint64_t id, Tick effect) {
   source.heard = effect;
   by_silence_.emplace(effect, id);
   return &source;
+}
+
+// Forces act again in every tick, so there are only so many. False: there is no room for this one.
+bool LiveInputs::TakeLasting(const Input& input, Tick effect) {
+  if (input.ticks == 1) return true;
+  while (!lasting_.empty() && lasting_.begin()->first < effect) {
+    lasting_cost_ -= lasting_.begin()->second;
+    lasting_.erase(lasting_.begin());
+  }
+  if (lasting_cost_ + CostOf(input) > limits_.lasting) return false;
+  lasting_cost_ += CostOf(input);
+  lasting_.emplace(effect + input.ticks - 1, CostOf(input));
+  return true;
 }
 
 // A repeated input gets the outcome of the first; when that is no longer kept, it is told as not applied at tick 0.

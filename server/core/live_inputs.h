@@ -30,7 +30,7 @@ struct InputOutcome {
   Tick tick = 0;       // at whose start it took effect, or would have; 0: no longer known
   int64_t bodies = 0;  // on which it acted, in its first tick; 0: what it named was nowhere then
   BodyId body = 0;     // a spawn's
-  bool full = false;   // it does not act, since the world has as many clients, or bodies of clients, as it may
+  bool full = false;   // it does not act: the world has as many clients, bodies of clients, or forces as it may
 
   bool applied() const { return bodies > 0; }
   friend bool operator==(const InputOutcome&, const InputOutcome&) = default;
@@ -55,6 +55,7 @@ struct LiveLimits {
   size_t clients = size_t{1} << 16;
   int64_t bodies = limits::kMaxBodies;  // of clients, at once
   size_t outcomes = size_t{1} << 18;    // for those who repeat inputs
+  int lasting = 4096;                   // forces that act at once, by CostOf
 };
 
 class LiveInputs {
@@ -109,13 +110,16 @@ class LiveInputs {
   };
 
   Source* Find(uint64_t source, Tick effect);
+  bool TakeLasting(const Input& input, Tick effect);
   void Repeated(const InputName& name);
   void Keep(const InputOutcome& outcome);
 
   const LiveLimits limits_;
   std::deque<Input> offered_;
   InputSchedule due_;
-  int64_t bodies_ = 0;  // of clients
+  int64_t bodies_ = 0;                // of clients
+  std::multimap<Tick, int> lasting_;  // what forces cost, by their last tick
+  int lasting_cost_ = 0;
   BodyId next_body_ = kFirstLiveId;
   std::map<std::pair<Tick, InputName>, Open> open_;  // not settled
   std::map<InputName, Tick> effect_;                 // of these

@@ -118,6 +118,7 @@ TickLoop::Hooks Process::Hooks() {
   hooks.inputs = [this] { return simulation.inputs().Take(); };
   hooks.outcomes = [this](const std::vector<InputOutcome>& outcomes) { simulation.inputs().Settle(outcomes); };
   hooks.publish = [this](Region* region, int64_t bodies, const std::vector<Input>& delivered) {
+    simulation.inputs().Hear(delivered);
     simulation.AfterTick(region, bodies);
     recording.AfterTick(*region, delivered);
   };

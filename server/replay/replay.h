@@ -8,6 +8,7 @@
 #include <string>
 #include <vector>
 
+#include <absl/container/flat_hash_set.h>
 #include <absl/status/status.h>
 #include <absl/status/statusor.h>
 
@@ -16,12 +17,15 @@
 
 namespace aureole {
 
+// Gives each spawn its shape, which lists leave out where it is that of the spawn before.
+void ExpandShapes(google::protobuf::RepeatedPtrField<v1::Input>* inputs);
+
 class Replay {
  public:
   // One snapshot per region, of one tick and one world. InvalidArgument says what is wrong.
   static absl::StatusOr<std::unique_ptr<Replay>> Begin(const std::vector<v1::Snapshot>& snapshots);
 
-  // Takes an input that acts after tick(). InvalidArgument when it is none.
+  // Takes an input that acts after tick(), with its shape. InvalidArgument when it is none, or spawns a body again.
   absl::Status Add(const v1::Input& input);
   void RunTo(Tick n) { run_.RunTo(n); }
 
@@ -43,6 +47,7 @@ class Replay {
 
   const std::unique_ptr<World> world_;
   Undivided run_;
+  absl::flat_hash_set<BodyId> spawned_;  // or to be
 };
 
 }  // namespace aureole

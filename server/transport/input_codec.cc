@@ -224,6 +224,16 @@ absl::Status DecodeInputs(const google::protobuf::RepeatedPtrField<v1::Input>& i
   return absl::OkStatus();
 }
 
+void RecordInputs(const std::vector<Input>& inputs, google::protobuf::RepeatedPtrField<v1::Input>* out) {
+  const int before = out->size();
+  EncodeInputs(inputs, out);
+  for (size_t i = 0; i < inputs.size(); ++i) {
+    v1::Input* told = out->Mutable(before + static_cast<int>(i));
+    told->set_tick(inputs[i].tick);
+    told->set_body(inputs[i].body);
+  }
+}
+
 void RecordInput(const Input& input, v1::Input* out) {
   Encode(input, nullptr, out);
   out->set_tick(input.tick);

@@ -17,7 +17,9 @@ void EncodeInputs(const std::vector<Input>& inputs, google::protobuf::RepeatedPt
 // InvalidArgument names the field when it is no list that clients can have given and EncodeInputs have written.
 absl::Status DecodeInputs(const google::protobuf::RepeatedPtrField<v1::Input>& in, std::vector<Input>* out);
 
-// With its tick and the id of a spawned body, for recordings.
+// With their ticks and the ids of spawned bodies, for recordings; shapes as EncodeInputs tells them.
+void RecordInputs(const std::vector<Input>& inputs, google::protobuf::RepeatedPtrField<v1::Input>* out);
+// With its shape.
 void RecordInput(const Input& input, v1::Input* out);
 absl::Status ReadRecordedInput(const v1::Input& in, Input* out);
 

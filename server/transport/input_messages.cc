@@ -91,6 +91,16 @@ double CostOf(const v1::RemoveBodiesRequest& request, SpecCheck* check) {
   return request.body_size();
 }
 
+uint64_t LastSequence(const v1::SpawnBodiesRequest& request) {
+  uint64_t copies = 0;
+  for (const v1::Body& b : request.bodies()) copies += static_cast<uint64_t>(Copies(b.array()));
+  return request.sequence() + copies - 1;
+}
+
+uint64_t LastSequence(const v1::RemoveBodiesRequest& request) {
+  return request.sequence() + static_cast<uint64_t>(request.body_size()) - 1;
+}
+
 std::vector<Input> ReadSpawns(const InputScene& scene, const v1::SpawnBodiesRequest& request, SpecCheck* check) {
   BodyReader reader(scene.reader, check);
   std::vector<BodySpec> bodies;

@@ -39,6 +39,9 @@ ImpulseInputs ReadBatch(const InputScene& scene, const Path& path, const v1::Imp
 // How many inputs the message is worth. Checks what can be checked without reading bodies; cheap.
 double CostOf(const v1::SpawnBodiesRequest& request, SpecCheck* check);
 double CostOf(const v1::RemoveBodiesRequest& request, SpecCheck* check);
+// After CostOf: the sequence of the last body.
+uint64_t LastSequence(const v1::SpawnBodiesRequest& request);
+uint64_t LastSequence(const v1::RemoveBodiesRequest& request);
 // After CostOf. One input per body, sequences growing by one.
 std::vector<Input> ReadSpawns(const InputScene& scene, const v1::SpawnBodiesRequest& request, SpecCheck* check);
 std::vector<Input> ReadRemovals(const InputScene& scene, const v1::RemoveBodiesRequest& request, SpecCheck* check);

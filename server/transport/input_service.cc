@@ -12,6 +12,7 @@ namespace aureole {
 namespace {
 
 constexpr size_t kMostAllowances = 1 << 16;  // of clients, kept between their calls
+constexpr size_t kMostGreatest = 1 << 17;
 
 grpc::Status TooMany(double rate) {
   return Refusal(
@@ -85,7 +86,7 @@ class InputService::ImpulseStream final : public Call<grpc::ServerReadReactor<v1
     } else {
       AddRejected(ReasonOf(outcome), outcome.name.second, summary_->mutable_rejected());
     }
-    summary_->set_last_tick(std::max<int64_t>(summary_->last_tick(), outcome.tick));
+    if (outcome.applied()) summary_->set_last_tick(std::max<int64_t>(summary_->last_tick(), outcome.tick));
     Continue();
   }
 
@@ -103,7 +104,10 @@ class InputService::ImpulseStream final : public Call<grpc::ServerReadReactor<v1
     if (ok) {
       if (service_->scene_ == nullptr) return End(RegionGivenUp());
       client_ = read.client;
-      waiting_ += service_->Offer(this, std::move(read.inputs));
+      size_t taken = 0;
+      const grpc::Status refusal = service_->Offer(this, std::move(read.inputs), &taken);
+      waiting_ += taken;
+      if (!refusal.ok()) return End(refusal);
       if (!read.refusal.ok()) return End(read.refusal);
     }
     all_read_ = !ok;
@@ -132,7 +136,7 @@ class InputService::BodiesCall : public Call<grpc::ServerUnaryReactor> {
 
   // `inputs`: one per body, with their sources, sequences growing by one; they have been allowed.
   void Offer(std::vector<Input> inputs) {
-    if (!service_->HasRoom(inputs.back())) return End(TooMany(service_->scene_->limits.rate));
+    if (!service_->HasRoom(static_cast<int64_t>(inputs.size()))) return End(TooMany(service_->scene_->limits.rate));
     waiting_ = inputs.size();
     for (Input& i : inputs) service_->Submit(this, std::move(i));
   }
@@ -165,7 +169,7 @@ class InputService::SpawnCall final : public BodiesCall {
     } else {
       AddRejected(ReasonOf(outcome), outcome.name.second, response_->mutable_rejected());
     }
-    response_->set_tick(std::max<int64_t>(response_->tick(), outcome.tick));
+    if (outcome.applied()) response_->set_tick(std::max<int64_t>(response_->tick(), outcome.tick));
   }
 
   const uint64_t first_;
@@ -226,7 +230,9 @@ grpc::ServerUnaryReactor* InputService::Start(BodiesCall* call, const Request& r
       return call;
     }
     cost = CostOf(request, &check);
-    if (check.ok() && !IsRepeat(request.client(), request.sequence()) && !Allow(request.client(), cost)) {
+    // A repetition, when its last input was taken before.
+    const bool repeat = check.ok() && IsRepeat(request.client(), LastSequence(request));
+    if (check.ok() && !Allow(request.client(), cost, repeat)) {
       call->End(TooMany(scene->limits.rate));
       return call;
     }
@@ -264,8 +270,8 @@ grpc::Status InputService::Offer(InputCaller* caller, const Path& path, const v1
   *client = read.client;
   const std::lock_guard lock(mutex_);
   if (scene_ == nullptr) return RegionGivenUp();
-  *taken = Offer(caller, std::move(read.inputs));
-  return read.refusal;
+  const grpc::Status refusal = Offer(caller, std::move(read.inputs), taken);
+  return refusal.ok() ? read.refusal : refusal;
 }
 
 std::shared_ptr<const InputScene> InputService::scene() {
@@ -273,21 +279,25 @@ std::shared_ptr<const InputScene> InputService::scene() {
   return scene_;
 }
 
-// Returns how many were taken; the others are rejected.
-size_t InputService::Offer(InputCaller* caller, std::vector<Input> inputs) {
-  size_t taken = 0;
+// New ones over the limits are rejected, each for good. Of one that was taken before that cannot be said: it may have
+// acted; then the whole call ends.
+grpc::Status InputService::Offer(InputCaller* caller, std::vector<Input> inputs, size_t* taken) {
   for (Input& input : inputs) {
-    const bool within = IsWithin(scene_->limits, input);
-    const double cost = static_cast<double>(CostOf(input)) * static_cast<double>(input.ticks);
-    const bool allowed = IsRepeat(input.source, input.sequence) || Allow(input.source, cost);
-    if (!within || !allowed || !HasRoom(input)) {
-      caller->Reject(within ? v1::RATE_LIMIT : v1::TOO_STRONG, input.sequence);
+    if (!IsWithin(scene_->limits, input)) {
+      caller->Reject(v1::TOO_STRONG, input.sequence);
+      continue;
+    }
+    const bool repeat = IsRepeat(input.source, input.sequence);
+    const double cost = static_cast<double>(CostOf(input)) * (repeat ? 1 : static_cast<double>(input.ticks));
+    if (!HasRoom(CostOf(input)) || !Allow(input.source, cost, repeat)) {
+      if (repeat) return TooMany(scene_->limits.rate);
+      caller->Reject(v1::RATE_LIMIT, input.sequence);
       continue;
     }
     Submit(caller, std::move(input));
-    ++taken;
+    ++*taken;
   }
-  return taken;
+  return grpc::Status::OK;
 }
 
 void InputService::Serve(const v1::WorldSpec& spec, int64_t tick_us) {
@@ -305,9 +315,10 @@ std::vector<Input> InputService::Take() {
   const std::lock_guard lock(mutex_);
   std::vector<Input> out;
   int cost = 0;
-  while (!queue_.empty() && cost < LiveInputs::kMostPerTick) {
+  while (!queue_.empty()) {
     Queued& next = queue_.front();
     cost += CostOf(next.input);
+    if (cost > LiveInputs::kMostPerTick) break;
     queued_ -= CostOf(next.input);
     queued_bytes_ -= next.bytes;
     out.push_back(std::move(next.input));
@@ -323,17 +334,30 @@ void InputService::Settle(const std::vector<InputOutcome>& outcomes) {
     if (it == waiting_.end()) continue;  // its call has ended
     InputCaller* caller = it->second;
     waiting_.erase(it);
+    --caller->open_;
     caller->Settle(o);
   }
 }
 
-// It was taken before. It is not charged: refused now, it might have acted all the same.
-bool InputService::IsRepeat(uint64_t client, uint64_t sequence) const {
-  const auto it = allowances_.find(client);
-  return it != allowances_.end() && sequence <= it->second.sequence;
+void InputService::Hear(const std::vector<Input>& delivered) {
+  if (delivered.empty()) return;
+  const std::lock_guard lock(mutex_);
+  for (const Input& input : delivered) Note(input.source, input.sequence);
 }
 
-bool InputService::Allow(uint64_t client, double inputs) {
+void InputService::Note(uint64_t client, uint64_t sequence) {
+  if (greatest_.size() >= kMostGreatest && !greatest_.contains(client)) greatest_.clear();
+  uint64_t& greatest = greatest_[client];
+  greatest = std::max(greatest, sequence);
+}
+
+bool InputService::IsRepeat(uint64_t client, uint64_t sequence) const {
+  const auto it = greatest_.find(client);
+  return it != greatest_.end() && sequence <= it->second;
+}
+
+// Repetitions have an allowance of their own: refused for what is new, they might have acted all the same.
+bool InputService::Allow(uint64_t client, double inputs, bool repeat) {
   const double rate = scene_->limits.rate;
   const Clock::time_point now = Clock::now();
   if (allowances_.size() >= kMostAllowances && !allowances_.contains(client)) {
@@ -342,24 +366,27 @@ bool InputService::Allow(uint64_t client, double inputs) {
     // Those of clients that were silent for a second are full again, as are those of new ones.
     absl::erase_if(allowances_, [now](const auto& e) { return now - e.second.at > std::chrono::seconds(1); });
   }
-  const auto [it, fresh] = allowances_.try_emplace(client, Allowance{rate, now});
+  const auto [it, fresh] = allowances_.try_emplace(client, Allowance{rate, rate, now});
   Allowance& a = it->second;
-  a.left = std::min(rate, a.left + rate * std::chrono::duration<double>(now - a.at).count());
+  const double more = rate * std::chrono::duration<double>(now - a.at).count();
+  a.left = std::min(rate, a.left + more);
+  a.repeats = std::min(rate, a.repeats + more);
   a.at = now;
+  double& left = repeat ? a.repeats : a.left;
   // A force of many ticks may take more than a second's; then it takes all of it.
-  if (a.left < std::min(inputs, rate)) return false;
-  a.left -= std::min(inputs, rate);
+  if (left < std::min(inputs, rate)) return false;
+  left -= std::min(inputs, rate);
   return true;
 }
 
-bool InputService::HasRoom(const Input& input) const {
-  return queued_ + CostOf(input) <= kMostQueued && queued_bytes_ <= kMostQueuedBytes;
+bool InputService::HasRoom(int64_t cost) const {
+  return queued_ + cost <= kMostQueued && queued_bytes_ <= kMostQueuedBytes;
 }
 
 void InputService::Submit(InputCaller* caller, Input input) {
   waiting_.emplace(InputName{input.source, input.sequence}, caller);
-  uint64_t& greatest = allowances_[input.source].sequence;
-  greatest = std::max(greatest, input.sequence);
+  ++caller->open_;
+  Note(input.source, input.sequence);
   const auto bytes = static_cast<int64_t>(BytesOf(input, queue_.empty() ? nullptr : &queue_.back().input));
   queued_ += CostOf(input);
   queued_bytes_ += bytes;
@@ -368,7 +395,7 @@ void InputService::Submit(InputCaller* caller, Input input) {
 
 void InputService::Remove(InputCaller* caller) {
   callers_.erase(caller);
-  std::erase_if(waiting_, [caller](const auto& e) { return e.second == caller; });
+  if (caller->open_ > 0) std::erase_if(waiting_, [caller](const auto& e) { return e.second == caller; });
 }
 
 }  // namespace aureole

@@ -29,6 +29,10 @@ class InputCaller {
   // An input that was rejected at once; its outcome does not follow.
   virtual void Reject(v1::Reason reason, uint64_t sequence) = 0;
   virtual void End(const grpc::Status& status) = 0;
+
+ private:
+  friend class InputService;
+  int64_t open_ = 0;  // inputs that the service knows to wait
 };
 
 class InputService {
@@ -61,6 +65,8 @@ class InputService {
   // them.
   std::vector<Input> Take();
   void Settle(const std::vector<InputOutcome>& outcomes);
+  // From the tick thread: what any server's clients sent and takes effect.
+  void Hear(const std::vector<Input>& delivered);
 
  private:
   using Clock = std::chrono::steady_clock;
@@ -75,8 +81,8 @@ class InputService {
   // What a client may still send; refills with time.
   struct Allowance {
     double left = 0;
+    double repeats = 0;  // likewise, of what was taken before
     Clock::time_point at;
-    uint64_t sequence = 0;  // the greatest that was taken
   };
   struct Queued {
     Input input;
@@ -90,10 +96,11 @@ class InputService {
   std::shared_ptr<const InputScene> scene();
 
   // All hold the mutex.
-  size_t Offer(InputCaller* caller, std::vector<Input> inputs);
+  grpc::Status Offer(InputCaller* caller, std::vector<Input> inputs, size_t* taken);
   bool IsRepeat(uint64_t client, uint64_t sequence) const;
-  bool Allow(uint64_t client, double inputs);
-  bool HasRoom(const Input& input) const;
+  bool Allow(uint64_t client, double inputs, bool repeat);
+  bool HasRoom(int64_t cost) const;
+  void Note(uint64_t client, uint64_t sequence);
   void Submit(InputCaller* caller, Input input);
   void Remove(InputCaller* caller);
 
@@ -105,7 +112,8 @@ class InputService {
   // By input, the calls that wait for it; more than one when it was repeated.
   std::multimap<InputName, InputCaller*> waiting_;
   absl::flat_hash_map<uint64_t, Allowance> allowances_;
-  Clock::time_point purged_at_;  // of those that are full again
+  Clock::time_point purged_at_;                       // of those that are full again
+  absl::flat_hash_map<uint64_t, uint64_t> greatest_;  // sequences that any server has taken, by client
 };
 
 // Why it did not act; unspecified when it did.

@@ -2,6 +2,7 @@
 
 #include <utility>
 
+#include <absl/strings/str_cat.h>
 #include <grpcpp/server_context.h>
 
 #include "server/transport/error_status.h"
@@ -20,7 +21,6 @@ class LayoutService::Stream final : public grpc::ServerWriteReactor<v1::LayoutUp
   void Offer(const v1::RegionStatus& status) {
     if (ended_) return;
     *next_.mutable_status() = status;
-    if (!auras_) next_.mutable_status()->clear_aura();
     waiting_ = true;
     Continue();
   }
@@ -83,10 +83,13 @@ grpc::ServerWriteReactor<v1::LayoutUpdate>* LayoutService::Watch(grpc::CallbackS
   const std::lock_guard lock(mutex_);
   streams_.insert(stream);
   want_auras_ += request.auras() ? 1 : 0;
-  if (serving_) {
-    stream->OfferWorld(world_);
-  } else {
+  if (!serving_) {
     stream->End(NoRegion());
+  } else if (streams_.size() > kMostStreams) {
+    stream->End(Refusal(grpc::StatusCode::RESOURCE_EXHAUSTED, v1::BUSY, "",
+                        absl::StrCat("the server tells its status to at most ", kMostStreams, " clients; try later")));
+  } else {
+    stream->OfferWorld(world_);
   }
   return stream;
 }
@@ -104,7 +107,7 @@ void LayoutService::Stop() {
 }
 
 void LayoutService::AfterTick(const Region& region) {
-  if (want_auras_ == 0) return;
+  if (want_auras_ == 0) return auras_.clear();
   const Clock::time_point now = Clock::now();
   if (now - auras_at_ < kAuraEvery) return;
   auras_at_ = now;
@@ -134,13 +137,12 @@ void LayoutService::Report(const v1::Report& report, int64_t clients, int64_t cl
   status.set_waits(report.waits());
   status.set_wait_us(report.wait_us());
   *status.mutable_waiting_for() = report.waiting_for();
-  if (want_auras_ > 0) {
-    for (const WireBox& box : auras_) {
-      for (float v : box.min) status.add_aura(v);
-      for (float v : box.max) status.add_aura(v);
-    }
+  v1::RegionStatus with_auras = status;
+  for (const WireBox& box : auras_) {
+    for (float v : box.min) with_auras.add_aura(v);
+    for (float v : box.max) with_auras.add_aura(v);
   }
-  for (Stream* s : streams_) s->Offer(status);
+  for (Stream* s : streams_) s->Offer(s->auras() ? with_auras : status);
 }
 
 }  // namespace aureole

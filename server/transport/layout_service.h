@@ -21,6 +21,7 @@ class LayoutService {
  public:
   // Boxes of one status, and how old they may be.
   static constexpr size_t kMostAuras = 4096;
+  static constexpr size_t kMostStreams = 64;
   static constexpr std::chrono::milliseconds kAuraEvery{200};
   // A reader that takes nothing for so long is cut off.
   static constexpr std::chrono::seconds kLongestWrite{10};

@@ -33,8 +33,9 @@ v1::StateHashes HashesOf(const Region& region) {
 // One call. Guarded by the service's mutex; deletes itself.
 class RecordingService::Stream final : public grpc::ServerWriteReactor<v1::Recorded> {
  public:
-  Stream(RecordingService* service, const v1::RecordRequest& request)
+  Stream(RecordingService* service, grpc::CallbackServerContext* context, const v1::RecordRequest& request)
       : service_(service),
+        context_(context),
         from_(request.from_tick()),
         hash_every_(request.hash_every() > 0 ? request.hash_every() : kHashEvery),
         inputs_(request.inputs()) {}
@@ -43,13 +44,10 @@ class RecordingService::Stream final : public grpc::ServerWriteReactor<v1::Recor
   bool ended() const { return ended_; }
   bool WantsHashes(Tick n) const { return !ended_ && n >= from_ && (n == from_ || n % hash_every_ == 0); }
 
-  void AddSnapshot(const v1::Snapshot& snapshot) {
-    const std::string bytes = snapshot.SerializeAsString();
-    for (size_t at = 0; at < bytes.size(); at += kPartBytes) {
-      v1::Recorded& part = queue_.emplace_back();
-      part.set_snapshot_part(bytes.substr(at, kPartBytes));
-      part.set_snapshot_complete(at + kPartBytes >= bytes.size());
-    }
+  // A serialised Snapshot, which all streams of this tick share.
+  void AddSnapshot(std::shared_ptr<const std::string> snapshot) {
+    snapshot_ = std::move(snapshot);
+    told_ = 0;
   }
 
   // Of a tick after from().
@@ -57,9 +55,7 @@ class RecordingService::Stream final : public grpc::ServerWriteReactor<v1::Recor
     if (hashes == nullptr && (!inputs_ || delivered.empty())) return;
     v1::Recorded& next = queue_.emplace_back();
     next.set_tick(tick);
-    if (inputs_) {
-      for (const Input& i : delivered) RecordInput(i, next.add_inputs());
-    }
+    if (inputs_) RecordInputs(delivered, next.mutable_inputs());
     if (hashes != nullptr) *next.mutable_hashes() = *hashes;
     waiting_bytes_ += next.ByteSizeLong();
     if (waiting_bytes_ > kMostWaiting) {
@@ -70,11 +66,25 @@ class RecordingService::Stream final : public grpc::ServerWriteReactor<v1::Recor
   }
 
   void Continue() {
-    if (writing_ || ended_ || queue_.empty()) return;
-    out_ = std::move(queue_.front());
-    queue_.pop_front();
-    if (out_.tick() != 0) waiting_bytes_ -= out_.ByteSizeLong();
+    if (writing_ && Clock::now() - written_at_ > kLongestWrite) context_->TryCancel();
+    if (writing_ || ended_) return;
+    if (snapshot_ != nullptr) {
+      out_.Clear();
+      out_.set_snapshot_part(snapshot_->substr(told_, kPartBytes));
+      told_ += kPartBytes;
+      if (told_ >= snapshot_->size()) {
+        out_.set_snapshot_complete(true);
+        snapshot_ = nullptr;
+      }
+    } else if (!queue_.empty()) {
+      out_ = std::move(queue_.front());
+      queue_.pop_front();
+      waiting_bytes_ -= out_.ByteSizeLong();
+    } else {
+      return;
+    }
     writing_ = true;
+    written_at_ = Clock::now();
     StartWrite(&out_);
   }
 
@@ -83,6 +93,7 @@ class RecordingService::Stream final : public grpc::ServerWriteReactor<v1::Recor
     if (std::exchange(ended_, true)) return;
     verdict_ = status;
     queue_.clear();
+    snapshot_ = nullptr;
     if (!writing_) Finish(verdict_);
   }
 
@@ -106,19 +117,25 @@ class RecordingService::Stream final : public grpc::ServerWriteReactor<v1::Recor
   }
 
  private:
+  using Clock = std::chrono::steady_clock;
+
   RecordingService* const service_;
+  grpc::CallbackServerContext* const context_;
   const Tick from_, hash_every_;
   const bool inputs_;
-  std::deque<v1::Recorded> queue_;
+  std::shared_ptr<const std::string> snapshot_;  // null: told
+  size_t told_ = 0;                              // of its bytes
+  std::deque<v1::Recorded> queue_;               // after it
   size_t waiting_bytes_ = 0;
   v1::Recorded out_;
+  Clock::time_point written_at_;
   grpc::Status verdict_;
   bool writing_ = false, ended_ = false;
 };
 
-grpc::ServerWriteReactor<v1::Recorded>* RecordingService::Record(grpc::CallbackServerContext*,
+grpc::ServerWriteReactor<v1::Recorded>* RecordingService::Record(grpc::CallbackServerContext* context,
                                                                  const v1::RecordRequest* request) {
-  auto* stream = new Stream(this, *request);
+  auto* stream = new Stream(this, context, *request);
   const std::lock_guard lock(mutex_);
   // In this order: the tick thread says that a tick is over, then looks who records.
   streams_.insert(stream);
@@ -128,6 +145,9 @@ grpc::ServerWriteReactor<v1::Recorded>* RecordingService::Record(grpc::CallbackS
   } else if (!synchronous_) {
     stream->End(Refusal(grpc::StatusCode::FAILED_PRECONDITION, v1::BAD_VALUE, "",
                         "the world's exchange must have no delay; bodies are always under way in one that has"));
+  } else if (streams_.size() > kMostStreams) {
+    stream->End(Refusal(grpc::StatusCode::RESOURCE_EXHAUSTED, v1::BUSY, "",
+                        absl::StrCat("the server makes at most ", kMostStreams, " recordings at a time; try later")));
   } else if (request->from_tick() <= tick_) {
     stream->End(Refusal(grpc::StatusCode::OUT_OF_RANGE, v1::BAD_VALUE, "from_tick",
                         absl::StrCat("must be to come, and tick ", tick_.load(), " is over; ask for a later one")));
@@ -159,14 +179,16 @@ void RecordingService::AfterTick(const Region& region, const std::vector<Input>&
   const auto any = [this](auto condition) { return std::any_of(streams_.begin(), streams_.end(), condition); };
   v1::StateHashes hashes;
   if (any([n](const Stream* s) { return s->WantsHashes(n); })) hashes = HashesOf(region);
-  v1::Snapshot snapshot;
+  std::shared_ptr<const std::string> snapshot;
   if (any([n](const Stream* s) { return !s->ended() && s->from() == n; })) {
-    snapshot.set_region(region_);
-    snapshot.set_tick(n);
-    *snapshot.mutable_world() = world_;
+    v1::Snapshot taken;
+    taken.set_region(region_);
+    taken.set_tick(n);
+    *taken.mutable_world() = world_;
     RegionSnapshot state = region.Snapshot();
-    snapshot.set_state(std::move(state.state));
-    for (const Input& i : state.to_come) RecordInput(i, snapshot.add_to_come());
+    taken.set_state(std::move(state.state));
+    RecordInputs(state.to_come, taken.mutable_to_come());
+    snapshot = std::make_shared<const std::string>(taken.SerializeAsString());
   }
   for (Stream* s : streams_) {
     if (s->ended() || s->from() > n) continue;

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <atomic>
+#include <chrono>
 #include <memory>
 #include <mutex>
 #include <set>
@@ -18,13 +19,16 @@ class RecordingService final : public v1::Recording::CallbackService {
  public:
   static constexpr size_t kMostWaiting = 64 << 20;  // bytes, the snapshot not counted
   static constexpr size_t kPartBytes = 1 << 20;
+  static constexpr size_t kMostStreams = 4;
+  // A reader that takes nothing for so long is cut off.
+  static constexpr std::chrono::seconds kLongestWrite{10};
 
   grpc::ServerWriteReactor<v1::Recorded>* Record(grpc::CallbackServerContext* context,
                                                  const v1::RecordRequest* request) override;
 
   // From here on this region is served.
   void Serve(RegionId region, const v1::WorldSpec& world, bool synchronous);
-  // Ends all calls. AfterTick is not called after it.
+  // Ends all calls.
   void Stop();
   // From the tick thread, after each tick, with the inputs that were delivered in it. Costs nothing while nobody
   // records; else, at ticks with hashes, linear in the region's bodies.

@@ -50,7 +50,7 @@ class SimulationService final : public SimulationCalls {
 
   // From here on this region is served.
   void Serve(const v1::Assignment& assignment, const World& world);
-  // Ends all calls. AfterTick is not called after it.
+  // Ends all calls.
   void Stop();
   // After each tick, from the tick thread; `bodies`: that this region owns. Cost: ReplicaPublisher::AfterTick.
   void AfterTick(Region* region, int64_t bodies);

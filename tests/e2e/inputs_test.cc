@@ -260,19 +260,43 @@ TEST(Inputs, WhatIsNowhereOrTooMuchIsRejectedAloneWithTheReason) {
   });
 }
 
-// What has acted must not be told as rejected.
-TEST(Inputs, RepetitionsAreNotChargedAgainstTheRate) {
+// What has acted must not be told as rejected: not where it was sent, and not at a server that only heard of it.
+TEST(Inputs, RepetitionsAreNotChargedAgainstTheRateOfNewOnes) {
   v1::WorldSpec world = Lanes();
   world.mutable_client_limits()->set_rate(20);
   PlayIn(world, 4, [](const std::vector<std::string>& endpoints) {
-    Client client(endpoints[1]);
     std::vector<v1::Impulse> pushes;
     for (uint64_t n = 1; n <= 20; ++n) pushes.push_back(Push(n, 1 + n % kBodies));
-    for (int repetition = 0; repetition < 3; ++repetition) {
+    for (size_t server : {1, 1, 2}) {
       v1::ImpulseSummary summary;
-      ASSERT_TRUE(client.Send(77, pushes, &summary, false).ok());
+      const grpc::Status s = Client(endpoints[server]).Send(77, pushes, &summary, false);
+      ASSERT_TRUE(s.ok()) << s.error_message();
       EXPECT_EQ(summary.applied(), 20) << summary.ShortDebugString();
     }
+    // More of them than that end the call; of none it is said that it was rejected.
+    v1::ImpulseSummary summary;
+    grpc::Status s;
+    for (int repetition = 0; repetition < 50 && s.ok(); ++repetition) {
+      s = Client(endpoints[2]).Send(77, pushes, &summary, false);
+      EXPECT_TRUE(!s.ok() || summary.applied() == 20);
+    }
+    EXPECT_EQ(s.error_code(), grpc::StatusCode::RESOURCE_EXHAUSTED);
+    // What is new beside a repetition is charged.
+    v1::SpawnBodiesRequest spawn;
+    spawn.set_client(77);
+    spawn.set_sequence(20);
+    v1::Body* body = spawn.add_bodies();
+    body->mutable_shape()->mutable_sphere()->set_radius(0.2);
+    body->mutable_position()->set_y(500);
+    body->mutable_array()->set_y(20);
+    body->mutable_array()->mutable_spacing()->set_y(1);
+    v1::SpawnBodiesResponse response;
+    for (int calls = 0; calls < 50; ++calls) {
+      s = Client(endpoints[1]).Spawn(spawn, &response);
+      if (!s.ok()) break;
+      spawn.set_sequence(spawn.sequence() + 19);
+    }
+    EXPECT_EQ(s.error_code(), grpc::StatusCode::RESOURCE_EXHAUSTED);
   });
 }
 

@@ -135,6 +135,31 @@ TEST(LiveInputs, NoMoreBodiesOfClientsThanTheWorldHolds) {
   EXPECT_TRUE(outcomes[2].full);
 }
 
+TEST(LiveInputs, OnlySoManyForcesActAtOnce) {
+  LiveInputs live({.lasting = 130});
+  const auto force = [](uint64_t sequence, double radius) {
+    Input i = Kick(sequence);
+    i.ticks = 10;
+    if (radius > 0) i.body = 0;
+    i.area.radius = radius;
+    return i;
+  };
+  for (uint64_t n = 1; n <= 3; ++n) ASSERT_TRUE(live.Offer(force(n, 5)).ok());
+  for (uint64_t n = 4; n <= 6; ++n) ASSERT_TRUE(live.Offer(force(n, 0)).ok());
+  RunTick(&live, 1);
+  std::vector<bool> full;
+  for (const InputOutcome& o : live.TakeOutcomes()) full.push_back(o.full);
+  EXPECT_EQ(full, (std::vector<bool>{false, false, true, false, false, true}));
+  ASSERT_TRUE(live.Offer(Kick(7)).ok());
+  ASSERT_TRUE(live.Offer(force(8, 0)).ok());
+  RunTick(&live, 10);
+  ASSERT_TRUE(live.Offer(force(9, 0)).ok());
+  RunTick(&live, 11);  // those of tick 1 are over
+  full.clear();
+  for (const InputOutcome& o : live.TakeOutcomes()) full.push_back(o.full);
+  EXPECT_EQ(full, (std::vector<bool>{false, true, false}));
+}
+
 TEST(LiveInputs, ClientThatWasSilentForLongestMakesRoomAndOneThatHasSpokenDoesNot) {
   LiveInputs live({.clients = 2});
   const auto kick = [](uint64_t client, uint64_t sequence) {
