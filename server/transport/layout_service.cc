@@ -3,23 +3,22 @@
 #include <utility>
 
 #include <absl/strings/str_cat.h>
-#include <grpcpp/server_context.h>
 
 #include "server/transport/error_status.h"
+#include "server/transport/message_stream.h"
 
 namespace aureole {
 
-// One call. Guarded by the service's mutex; deletes itself. One write in flight; what it could not take in time is
-// replaced by what is newer.
-class LayoutService::Stream final : public grpc::ServerWriteReactor<v1::LayoutUpdate> {
+// One call. What it could not take in time is replaced by what is newer.
+class LayoutService::Stream final : public MessageStream<v1::LayoutUpdate> {
  public:
   Stream(LayoutService* service, grpc::CallbackServerContext* context, bool auras)
-      : service_(service), context_(context), auras_(auras) {}
+      : MessageStream(&service->mutex_, context), service_(service), auras_(auras) {}
 
   bool auras() const { return auras_; }
 
   void Offer(const v1::RegionStatus& status) {
-    if (ended_) return;
+    if (ended()) return;
     *next_.mutable_status() = status;
     waiting_ = true;
     Continue();
@@ -30,51 +29,21 @@ class LayoutService::Stream final : public grpc::ServerWriteReactor<v1::LayoutUp
     Continue();
   }
 
-  // No further write; finishes now, or when the write in flight is done.
-  void End(const grpc::Status& status) {
-    if (std::exchange(ended_, true)) return;
-    verdict_ = status;
-    if (!writing_) Finish(verdict_);
-  }
-
-  void OnWriteDone(bool ok) override {
-    const std::lock_guard lock(service_->mutex_);
-    writing_ = false;
-    if (ended_) return Finish(verdict_);
-    if (!ok) return End(grpc::Status::CANCELLED);
-    Continue();
-  }
-  void OnCancel() override {
-    const std::lock_guard lock(service_->mutex_);
-    End(grpc::Status::CANCELLED);
-  }
-  void OnDone() override {
-    {
-      const std::lock_guard lock(service_->mutex_);
-      service_->streams_.erase(this);
-      service_->want_auras_ -= auras_ ? 1 : 0;
-    }
-    delete this;
-  }
-
  private:
-  void Continue() {
-    if (writing_ && Clock::now() - written_at_ > kLongestWrite) context_->TryCancel();
-    if (writing_ || ended_ || !waiting_) return;
-    out_ = std::exchange(next_, {});
-    waiting_ = false;
-    writing_ = true;
-    written_at_ = Clock::now();
-    StartWrite(&out_);
+  bool Next(v1::LayoutUpdate* out) override {
+    if (!std::exchange(waiting_, false)) return false;
+    *out = std::exchange(next_, {});
+    return true;
+  }
+  void Leave() override {
+    service_->streams_.erase(this);
+    service_->want_auras_ -= auras_ ? 1 : 0;
   }
 
   LayoutService* const service_;
-  grpc::CallbackServerContext* const context_;
   const bool auras_;
-  v1::LayoutUpdate out_, next_;
-  Clock::time_point written_at_;
-  grpc::Status verdict_;
-  bool waiting_ = false, writing_ = false, ended_ = false;
+  v1::LayoutUpdate next_;
+  bool waiting_ = false;  // next_ is something
 };
 
 grpc::ServerWriteReactor<v1::LayoutUpdate>* LayoutService::Watch(grpc::CallbackServerContext* context,

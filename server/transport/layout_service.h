@@ -23,8 +23,6 @@ class LayoutService {
   static constexpr size_t kMostAuras = 4096;
   static constexpr size_t kMostStreams = 64;
   static constexpr std::chrono::milliseconds kAuraEvery{200};
-  // A reader that takes nothing for so long is cut off.
-  static constexpr std::chrono::seconds kLongestWrite{10};
 
   // From any thread; the calls of clients.
   grpc::ServerWriteReactor<v1::LayoutUpdate>* Watch(grpc::CallbackServerContext* context,

@@ -6,10 +6,10 @@
 #include <utility>
 
 #include <absl/strings/str_cat.h>
-#include <grpcpp/server_context.h>
 
 #include "server/transport/error_status.h"
 #include "server/transport/input_codec.h"
+#include "server/transport/message_stream.h"
 
 namespace aureole {
 namespace {
@@ -30,19 +30,18 @@ v1::StateHashes HashesOf(const Region& region) {
 
 }  // namespace
 
-// One call. Guarded by the service's mutex; deletes itself.
-class RecordingService::Stream final : public grpc::ServerWriteReactor<v1::Recorded> {
+// One call.
+class RecordingService::Stream final : public MessageStream<v1::Recorded> {
  public:
   Stream(RecordingService* service, grpc::CallbackServerContext* context, const v1::RecordRequest& request)
-      : service_(service),
-        context_(context),
+      : MessageStream(&service->mutex_, context),
+        service_(service),
         from_(request.from_tick()),
         hash_every_(request.hash_every() > 0 ? request.hash_every() : kHashEvery),
         inputs_(request.inputs()) {}
 
   Tick from() const { return from_; }
-  bool ended() const { return ended_; }
-  bool WantsHashes(Tick n) const { return !ended_ && n >= from_ && (n == from_ || n % hash_every_ == 0); }
+  bool WantsHashes(Tick n) const { return !ended() && n >= from_ && (n == from_ || n % hash_every_ == 0); }
 
   // A serialised Snapshot, which all streams of this tick share.
   void AddSnapshot(std::shared_ptr<const std::string> snapshot) {
@@ -59,78 +58,41 @@ class RecordingService::Stream final : public grpc::ServerWriteReactor<v1::Recor
     if (hashes != nullptr) *next.mutable_hashes() = *hashes;
     waiting_bytes_ += next.ByteSizeLong();
     if (waiting_bytes_ > kMostWaiting) {
+      queue_.clear();
+      snapshot_ = nullptr;
       End(Refusal(grpc::StatusCode::RESOURCE_EXHAUSTED, v1::TOO_SLOW, "",
                   "the reader is 64 MiB behind; read faster, or ask for fewer hashes"));
     }
     Continue();
   }
 
-  void Continue() {
-    if (writing_ && Clock::now() - written_at_ > kLongestWrite) context_->TryCancel();
-    if (writing_ || ended_) return;
+ private:
+  bool Next(v1::Recorded* out) override {
     if (snapshot_ != nullptr) {
-      out_.Clear();
-      out_.set_snapshot_part(snapshot_->substr(told_, kPartBytes));
+      out->Clear();
+      out->set_snapshot_part(snapshot_->substr(told_, kPartBytes));
       told_ += kPartBytes;
       if (told_ >= snapshot_->size()) {
-        out_.set_snapshot_complete(true);
+        out->set_snapshot_complete(true);
         snapshot_ = nullptr;
       }
-    } else if (!queue_.empty()) {
-      out_ = std::move(queue_.front());
-      queue_.pop_front();
-      waiting_bytes_ -= out_.ByteSizeLong();
-    } else {
-      return;
+      return true;
     }
-    writing_ = true;
-    written_at_ = Clock::now();
-    StartWrite(&out_);
+    if (queue_.empty()) return false;
+    *out = std::move(queue_.front());
+    queue_.pop_front();
+    waiting_bytes_ -= out->ByteSizeLong();
+    return true;
   }
-
-  // No further write; finishes now, or when the write in flight is done.
-  void End(const grpc::Status& status) {
-    if (std::exchange(ended_, true)) return;
-    verdict_ = status;
-    queue_.clear();
-    snapshot_ = nullptr;
-    if (!writing_) Finish(verdict_);
-  }
-
-  void OnWriteDone(bool ok) override {
-    const std::lock_guard lock(service_->mutex_);
-    writing_ = false;
-    if (ended_) return Finish(verdict_);
-    if (!ok) return End(grpc::Status::CANCELLED);
-    Continue();
-  }
-  void OnCancel() override {
-    const std::lock_guard lock(service_->mutex_);
-    End(grpc::Status::CANCELLED);
-  }
-  void OnDone() override {
-    {
-      const std::lock_guard lock(service_->mutex_);
-      service_->recorders_ -= static_cast<int>(service_->streams_.erase(this));
-    }
-    delete this;
-  }
-
- private:
-  using Clock = std::chrono::steady_clock;
+  void Leave() override { service_->recorders_ -= static_cast<int>(service_->streams_.erase(this)); }
 
   RecordingService* const service_;
-  grpc::CallbackServerContext* const context_;
   const Tick from_, hash_every_;
   const bool inputs_;
   std::shared_ptr<const std::string> snapshot_;  // null: told
   size_t told_ = 0;                              // of its bytes
   std::deque<v1::Recorded> queue_;               // after it
   size_t waiting_bytes_ = 0;
-  v1::Recorded out_;
-  Clock::time_point written_at_;
-  grpc::Status verdict_;
-  bool writing_ = false, ended_ = false;
 };
 
 grpc::ServerWriteReactor<v1::Recorded>* RecordingService::Record(grpc::CallbackServerContext* context,

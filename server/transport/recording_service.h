@@ -2,7 +2,6 @@
 #pragma once
 
 #include <atomic>
-#include <chrono>
 #include <memory>
 #include <mutex>
 #include <set>
@@ -20,8 +19,6 @@ class RecordingService final : public v1::Recording::CallbackService {
   static constexpr size_t kMostWaiting = 64 << 20;  // bytes, the snapshot not counted
   static constexpr size_t kPartBytes = 1 << 20;
   static constexpr size_t kMostStreams = 4;
-  // A reader that takes nothing for so long is cut off.
-  static constexpr std::chrono::seconds kLongestWrite{10};
 
   grpc::ServerWriteReactor<v1::Recorded>* Record(grpc::CallbackServerContext* context,
                                                  const v1::RecordRequest* request) override;
