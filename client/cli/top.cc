@@ -9,6 +9,7 @@
 
 #include <nlohmann/json.hpp>
 
+#include "client/cli/connect.h"
 #include "client/cli/exit_codes.h"
 #include "client/cli/flags.h"
 #include "client/cli/layout_watch.h"
@@ -51,9 +52,7 @@ bool AllLeft(const RunStatus& status) {
 
 CLI::App* AddTop(CLI::App& app, TopOptions* o) {
   CLI::App* c = app.add_subcommand("top", "How the region servers of a running world do");
-  c->add_option("--server", o->server, "Any region server of the world; aureole up names them")
-      ->required()
-      ->type_name("HOST:PORT");
+  AddServer(c, &o->server);
   AddDuration(c, &o->duration_s, "Until interrupted when not given");
   c->add_flag("--json", o->json, "JSON, one object per second");
   c->footer(std::string("Examples:\n"

@@ -234,12 +234,6 @@ void RecordInputs(const std::vector<Input>& inputs, google::protobuf::RepeatedPt
   }
 }
 
-void RecordInput(const Input& input, v1::Input* out) {
-  Encode(input, nullptr, out);
-  out->set_tick(input.tick);
-  out->set_body(input.body);
-}
-
 absl::Status ReadRecordedInput(const v1::Input& in, Input* out) {
   AUREOLE_RETURN_IF_ERROR(Decode(in, nullptr, out));
   if (in.tick() < 1) return Bad("tick", "must be at least 1");

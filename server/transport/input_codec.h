@@ -19,8 +19,7 @@ absl::Status DecodeInputs(const google::protobuf::RepeatedPtrField<v1::Input>& i
 
 // With their ticks and the ids of spawned bodies, for recordings; shapes as EncodeInputs tells them.
 void RecordInputs(const std::vector<Input>& inputs, google::protobuf::RepeatedPtrField<v1::Input>* out);
-// With its shape.
-void RecordInput(const Input& input, v1::Input* out);
+// Of one with its shape.
 absl::Status ReadRecordedInput(const v1::Input& in, Input* out);
 
 }  // namespace aureole

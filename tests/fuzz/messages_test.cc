@@ -310,9 +310,9 @@ TEST(FuzzMessage, RecordedInput) {
         Input read;
         if (!ReadRecordedInput(input, &read).ok()) return;
         ++taken;
-        v1::Input again;
-        RecordInput(read, &again);
-        ASSERT_TRUE(ReadRecordedInput(again, &read).ok());
+        google::protobuf::RepeatedPtrField<v1::Input> again;
+        RecordInputs({read}, &again);
+        ASSERT_TRUE(ReadRecordedInput(again[0], &read).ok());
       });
   EXPECT_GT(taken, 100);
 }

@@ -44,7 +44,7 @@ class Recorded {
     *out.mutable_world() = Falling();
     RegionSnapshot s = region_.Snapshot();
     out.set_state(s.state);
-    for (const Input& i : s.to_come) RecordInput(i, out.add_to_come());
+    RecordInputs(s.to_come, out.mutable_to_come());
     return out;
   }
   std::map<BodyId, uint64_t> Hashes() const {
@@ -94,8 +94,9 @@ TEST(Replay, AnInputThatIsMissingMakesItDiffer) {
   kick.source = kick.sequence = 1;
   kick.body = 11;
   kick.linear = Vec3(0, 3, 0);
-  v1::Input told;
-  RecordInput(kick, &told);
+  google::protobuf::RepeatedPtrField<v1::Input> all;
+  RecordInputs({kick}, &all);
+  const v1::Input& told = all[0];
   ASSERT_TRUE((*replay)->Add(told).ok());
   recorded.RunTo(29);
   (*replay)->RunTo(29);
