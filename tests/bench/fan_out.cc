@@ -8,6 +8,7 @@
 #include "server/control/local_allocator.h"
 #include "server/control/run.h"
 #include "tests/bench/load_process.h"
+#include "tests/bench/quantile.h"
 #include "tests/bench/rolling.h"
 
 namespace aureole {
@@ -15,13 +16,6 @@ namespace {
 
 constexpr int64_t kTickUs = kRollingTickUs;
 constexpr int64_t kWindowUs = 5'000'000;  // of the reports
-
-double Median(std::vector<double> v) {
-  if (v.empty()) return 0;
-  std::sort(v.begin(), v.end());
-  const size_t half = v.size() / 2;
-  return v.size() % 2 == 1 ? v[half] : (v[half - 1] + v[half]) / 2;
-}
 
 }  // namespace
 

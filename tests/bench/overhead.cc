@@ -11,6 +11,7 @@
 #include "server/core/region.h"
 #include "server/physics/bullet_engine.h"
 #include "server/physics/plain_bullet_world.h"
+#include "tests/bench/quantile.h"
 
 namespace aureole {
 namespace {
@@ -77,12 +78,6 @@ World Heap(int bodies) {
   return world;
 }
 
-double Median(std::vector<double> v, double share = 0.5) {
-  const auto at = static_cast<std::ptrdiff_t>(share * static_cast<double>(v.size() - 1));
-  std::nth_element(v.begin(), v.begin() + at, v.end());
-  return v[static_cast<size_t>(at)];
-}
-
 class Race {
  public:
   explicit Race(int bodies)
@@ -140,8 +135,8 @@ OverheadResult MeasureOverhead(const OverheadOptions& options) {
   result.region_ms = Median(region);
   result.stock_ms = Median(stock);
   result.ratio_median = Median(ratio);
-  result.ratio_low = Median(ratio, 0.25);
-  result.ratio_high = Median(ratio, 0.75);
+  result.ratio_low = Quantile(ratio, 0.25);
+  result.ratio_high = Quantile(ratio, 0.75);
   result.region_contacts = race.region().engine().Counts().contacts;
   result.stock_contacts = race.stock().CountContacts();
   result.state_hash = race.region().StateHash();

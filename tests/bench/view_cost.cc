@@ -16,6 +16,7 @@
 #include "server/core/region.h"
 #include "server/physics/bullet_engine.h"
 #include "server/transport/replica_publisher.h"
+#include "tests/bench/quantile.h"
 
 namespace aureole {
 namespace {
@@ -101,11 +102,6 @@ ReplicaRequest BoxAt(double x, double z) {
   box->mutable_max()->set_z(z + kViewSide * kSpacing - 0.1);
   SpecCheck check;
   return ReplicaRequest::Read(Path(), message, 16'000, &check);
-}
-
-double Median(std::vector<double> v) {
-  std::sort(v.begin(), v.end());
-  return v.empty() ? 0 : v[v.size() / 2];
 }
 
 class Watched {
