@@ -13,7 +13,7 @@
 
 #include <google/protobuf/util/message_differencer.h>
 
-#include "aureole/v1/recording.pb.h"
+#include "aureole/v1/recording.grpc.pb.h"
 #include "aureole/v1/simulation.grpc.pb.h"
 #include "server/transport/world_json.h"
 #include "tests/e2e/running_world.h"
@@ -147,6 +147,34 @@ TEST(Layout, SceneTellsWhatIsFixedWithItsScripts) {
     v1::GetWorldResponse plain;
     ASSERT_TRUE(Connect(endpoints[0])->GetWorld(&context, {}, &plain).ok());
     EXPECT_EQ(plain.scene_size(), 0);
+  });
+}
+
+TEST(Recording, OfMoreThanTheServerMakesIsRefusedAsBusy) {
+  PlayIn(Sliding(), 2, [](const std::vector<std::string>& endpoints) {
+    const auto stub = v1::Recording::NewStub(grpc::CreateChannel(endpoints[0], grpc::InsecureChannelCredentials()));
+    v1::RecordRequest request;
+    request.set_from_tick(1'000'000'000);
+    std::vector<std::unique_ptr<grpc::ClientContext>> contexts;
+    std::vector<std::unique_ptr<grpc::ClientReader<v1::Recorded>>> streams;
+    for (int i = 0; i < 4; ++i) {
+      contexts.push_back(std::make_unique<grpc::ClientContext>());
+      SetDeadline(contexts.back().get());
+      streams.push_back(stub->Record(contexts.back().get(), request));
+    }
+    // The server may hear of it before it hears of those.
+    grpc::Status s;
+    for (int tries = 0; tries < 20 && s.error_code() != grpc::StatusCode::RESOURCE_EXHAUSTED; ++tries) {
+      grpc::ClientContext more;
+      more.set_deadline(std::chrono::system_clock::now() + std::chrono::milliseconds(500));
+      v1::Recorded none;
+      const auto stream = stub->Record(&more, request);
+      EXPECT_FALSE(stream->Read(&none));
+      s = stream->Finish();
+    }
+    EXPECT_TRUE(s.error_message().starts_with("BUSY")) << s.error_message();
+    for (auto& c : contexts) c->TryCancel();
+    for (auto& stream : streams) stream->Finish();
   });
 }
 
