@@ -41,6 +41,8 @@ class DelayedExchange final : public Protocol {
 
   void ObserveInFlight(std::vector<BodyRecord>* out) const override;
   void AppendAuras(size_t most, std::vector<WireBox>* out) const override;
+  void Save(Writer& a) const override { const_cast<DelayedExchange*>(this)->Visit(a); }
+  void Load(Reader& a) override { Visit(a); }
 
  private:
   // R12: what a body can do within the horizon, and what its aura says of it.
@@ -48,6 +50,11 @@ class DelayedExchange final : public Protocol {
     double push = 0, give = 0;  // m, as in Node
     BodyId group = 0;
     std::vector<double> energies;  // of the group, J: of own bodies, then as each peer tells
+
+    template <class Archive>
+    void Visit(Archive& a) {
+      a(push, give, group, energies);
+    }
   };
 
   // What the sender of a cluster knows of one of its bodies while it is in flight: states sent .. sent+k-1.
@@ -62,9 +69,19 @@ class DelayedExchange final : public Protocol {
       BodyView view;        // at the end of its tick
       Box box;              // exact, as the next step uses it
       uint64_t hash = 0;
+
+      template <class Archive>
+      void Visit(Archive& a) {
+        a(exists, steps, view, box, hash);
+      }
     };
     std::vector<State> states;
     Bound bound;  // when it was sent
+
+    template <class Archive>
+    void Visit(Archive& a) {
+      a(owner, epoch, sent, group, states, bound);
+    }
   };
 
   // A node of the graph that the decision of this tick looks at (R3).
@@ -76,6 +93,13 @@ class DelayedExchange final : public Protocol {
     double push = 0, give = 0;  // an edge when the gap is at most the sum of both: for AC, and for BT
     int source = 0;             // 1 + index of the peer that tells of it; 0: this region knows it itself
   };
+
+  // What outlives a tick.
+  template <class Archive>
+  void Visit(Archive& a) {
+    a(started_, groups_, remote_, away_, shadows_, waiting_, bounds_, most_push_, most_give_, kicks_, area_kicks_,
+      announced_, told_, told_away_, said_);
+  }
 
   Tick now() const { return h_.tick + 1; }
 

@@ -51,6 +51,11 @@ struct BodyView {
   double least_inertia = 0;  // the smallest principal moment, kg m^2
   double energy = 0;         // kinetic, of turning too, J; 0 when asleep
   bool asleep = false;
+
+  template <class Archive>
+  void Visit(Archive& a) {
+    a(id, box, centre, radius, velocity, mass, least_inertia, energy, asleep);
+  }
 };
 
 // Where an observer sees one body.

@@ -16,6 +16,11 @@ struct WireBox {
   float min[3] = {0, 0, 0};
   float max[3] = {0, 0, 0};
   friend bool operator==(const WireBox&, const WireBox&) = default;
+
+  template <class Archive>
+  void Visit(Archive& a) {
+    a(min, max);
+  }
 };
 WireBox RoundOutward(const Box& box);
 Box Widen(const WireBox& box);
@@ -33,12 +38,22 @@ struct Aura {
   float energy = 0;
   float mass = 0;
   friend bool operator==(const Aura&, const Aura&) = default;
+
+  template <class Archive>
+  void Visit(Archive& a) {
+    a(id, box, owner, group, energy, mass);
+  }
 };
 
 // Two bodies of different owners whose boxes meet, as the sender sees it (R16a).
 struct Edge {
   BodyId a = 0, b = 0;  // a < b
   friend bool operator==(const Edge&, const Edge&) = default;
+
+  template <class Archive>
+  void Visit(Archive& archive) {
+    archive(a, b);
+  }
 };
 
 // A contact component of the sender's own bodies that others may have to know of (R16b).
@@ -48,12 +63,22 @@ struct Fragment {
   uint32_t bodies = 0;        // all members
   std::vector<std::pair<RegionId, double>> mass_by_home;  // ascending by region; kg
   RegionId gives_back = kNoRegion;                        // R20: where it returns to, unless it has an edge
+
+  template <class Archive>
+  void Visit(Archive& a) {
+    a(known, id, bodies, mass_by_home, gives_back);
+  }
 };
 
 // A body that touches a region with which its owner exchanges no boxes yet.
 struct LateAura {
   RegionId to = kNoRegion;
   Aura aura;
+
+  template <class Archive>
+  void Visit(Archive& a) {
+    a(to, aura);
+  }
 };
 
 // An input of a client that a region has applied, and to how many of its bodies.
@@ -61,6 +86,11 @@ struct AppliedInput {
   InputName name;
   int64_t bodies = 0;
   friend bool operator==(const AppliedInput&, const AppliedInput&) = default;
+
+  template <class Archive>
+  void Visit(Archive& a) {
+    a(name, bodies);
+  }
 };
 
 // What a region says to all in each tick: k = 0 by R16; k >= 1 the last two only. Nothing to say: it is not passed on.
@@ -77,6 +107,11 @@ struct Graph {
   bool empty() const {
     return edges.empty() && fragments.empty() && late.empty() && opened.empty() && closed.empty() && inputs.empty() &&
            applied.empty();
+  }
+
+  template <class Archive>
+  void Visit(Archive& a) {
+    a(of, edges, fragments, late, opened, closed, inputs, applied);
   }
 };
 
@@ -100,6 +135,11 @@ struct Away {
   RegionId owner = kNoRegion;
   WireBox box;
   friend bool operator==(const Away&, const Away&) = default;
+
+  template <class Archive>
+  void Visit(Archive& a) {
+    a(id, owner, box);
+  }
 };
 
 // Rounds of the synchronous exchange within a tick. Graphs spread in two hops (server/core/allgather.h), and are made

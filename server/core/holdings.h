@@ -11,6 +11,7 @@
 #include <absl/status/status.h>
 #include <absl/status/statusor.h>
 
+#include "server/core/archive.h"
 #include "server/core/engine.h"
 #include "server/core/frame.h"
 #include "server/core/live_inputs.h"
@@ -24,6 +25,11 @@ struct Held {
   Epoch epoch = 0;
   Tick arrived = -1000000;  // tick at which it was transferred here; long ago for what began here
   int64_t transfer = 0;     // with which it came: the count of transfers here; 0: it began here
+
+  template <class Archive>
+  void Visit(Archive& a) {
+    a(epoch, arrived, transfer);
+  }
 };
 
 // Frames of one peer that wait for their phase.
@@ -34,11 +40,25 @@ class Inbox {
   absl::Status Accept(Frame frame, Tick now, bool synchronous);
   const Frame* Front() const { return frames_.empty() ? nullptr : &frames_.front(); }
   Frame Pop();
+  // Frames popped since the beginning of the world.
+  uint64_t taken() const { return taken_; }
+
+  // As far as frames were popped: those that wait are not in it, and come again.
+  template <class Archive>
+  void Visit(Archive& a) {
+    a(taken_, taken_tick_, taken_round_);
+    if constexpr (std::is_same_v<Archive, Reader>) {
+      frames_.clear();
+      tick_ = taken_tick_;
+      round_ = taken_round_;
+    }
+  }
 
  private:
   std::deque<Frame> frames_;
-  Tick tick_ = -1;
-  int round_ = kTransfers;
+  Tick tick_ = -1, taken_tick_ = -1;  // of the last one accepted, and popped
+  int round_ = kTransfers, taken_round_ = kTransfers;
+  uint64_t taken_ = 0;
 };
 
 struct Holdings {
@@ -77,6 +97,11 @@ struct Holdings {
   // Home crossings and bodies away from home among `near` (ascending ids of the bodies that may be either).
   void CountHomes(std::span<const BodyId> near);
 
+  // What decides the future, after a tick, and the counters. Load: into new holdings without bodies; false when the
+  // bytes are not what Save wrote.
+  void Save(Writer& a) const;
+  bool Load(Reader& a);
+
  private:
   // Bodies that came to be with others and have met none yet, and with which transfer.
   std::vector<std::pair<BodyId, int64_t>> newcomers_;
@@ -104,6 +129,9 @@ class Protocol {
   virtual void ObserveInFlight(std::vector<BodyRecord>* out) const = 0;
   // Appends at most so many of the boxes that peers hold of bodies here, each body once.
   virtual void AppendAuras(size_t most, std::vector<WireBox>* out) const = 0;
+  // After a tick: what it knows beside the holdings.
+  virtual void Save(Writer& a) const = 0;
+  virtual void Load(Reader& a) = 0;
 };
 
 std::unique_ptr<Protocol> MakeSyncExchange(Holdings& holdings);

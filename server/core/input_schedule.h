@@ -20,6 +20,11 @@ class InputSchedule {
   // Forgets what acted before tick n and acts no more.
   void ForgetBefore(Tick n);
 
+  template <class Archive>
+  void Visit(Archive& a) {
+    a(due_, lasting_);
+  }
+
  private:
   std::map<Tick, std::vector<Input>> due_;  // by the first tick
   std::vector<Input> lasting_;              // those of more than one

@@ -15,6 +15,10 @@ namespace aureole {
 template <class Message>
 class LinkSender {
  public:
+  LinkSender() = default;
+  // Goes on where another stopped: it keeps `kept`, the first of which has number `first`.
+  LinkSender(uint64_t first, std::deque<Message> kept) : first_(first), kept_(std::move(kept)) {}
+
   // Keeps the message and returns its number.
   uint64_t Push(Message m) {
     kept_.push_back(std::move(m));
@@ -34,8 +38,11 @@ class LinkSender {
   void Resume(uint64_t last_applied, Fn&& fn) const {
     for (uint64_t s = last_applied + 1; s < next(); ++s) fn(s, kept_[s - first_]);
   }
+  // Number of the oldest that is kept, and of the next one.
+  uint64_t first() const { return first_; }
   uint64_t next() const { return first_ + kept_.size(); }
   size_t kept() const { return kept_.size(); }
+  const std::deque<Message>& messages() const { return kept_; }
 
  private:
   uint64_t first_ = 1;  // number of kept_.front()
@@ -44,6 +51,10 @@ class LinkSender {
 
 class LinkReceiver {
  public:
+  LinkReceiver() = default;
+  // Goes on where another stopped.
+  explicit LinkReceiver(uint64_t applied) : applied_(applied) {}
+
   enum class Verdict { kApply, kDuplicate, kGap };
   // kApply: the next one, and it is now counted as applied. kGap: something is missing; the connection must resume.
   Verdict Check(uint64_t sequence) {

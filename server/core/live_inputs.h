@@ -34,6 +34,11 @@ struct InputOutcome {
 
   bool applied() const { return bodies > 0; }
   friend bool operator==(const InputOutcome&, const InputOutcome&) = default;
+
+  template <class Archive>
+  void Visit(Archive& a) {
+    a(name, tick, bodies, body, full);
+  }
 };
 
 // Bodies that clients spawn have ids from here on, in the order in which they are told.
@@ -95,10 +100,22 @@ class LiveInputs {
   // Since the last call: every input that will take effect, with its tick, the same in all regions.
   std::vector<Input> TakeDelivered() { return std::exchange(delivered_, {}); }
 
+  // All but the limits.
+  template <class Archive>
+  void Visit(Archive& a) {
+    a(offered_, due_, bodies_, lasting_, lasting_cost_, next_body_, open_, effect_, sources_, by_silence_, recent_,
+      outcome_of_, applied_, outcomes_, delivered_);
+  }
+
  private:
   struct Source {
     uint64_t last = 0;  // sequence delivered
     Tick heard = 0;     // when it took effect
+
+    template <class Archive>
+    void Visit(Archive& a) {
+      a(last, heard);
+    }
   };
   struct Open {
     int64_t bodies = 0;
@@ -107,6 +124,11 @@ class LiveInputs {
     bool full = false;
     BodyId spawned = 0;
     int mine = 0;  // how often it was offered here
+
+    template <class Archive>
+    void Visit(Archive& a) {
+      a(bodies, over_area, removes_live, full, spawned, mine);
+    }
   };
 
   Source* Find(uint64_t source, Tick effect);

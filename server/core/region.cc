@@ -60,17 +60,43 @@ absl::Status FindSpawn(const World& world, Input* spawn) {
 }  // namespace
 
 struct Region::Impl {
-  Impl(const World& world, RegionId self, std::unique_ptr<Engine> engine) : holdings(world, self, std::move(engine)) {}
+  Impl(const World& world, RegionId self, std::unique_ptr<Engine> engine) : holdings(world, self, std::move(engine)) {
+    AUREOLE_CHECK(self >= 0 && self < world.layout.size(), "region %d of %d", self, world.layout.size());
+  }
+  void MakeProtocol() {
+    protocol = holdings.world.exchange.k == 0 ? MakeSyncExchange(holdings) : MakeDelayedExchange(holdings);
+  }
   Holdings holdings;
   std::unique_ptr<Protocol> protocol;
 };
 
 Region::Region(const World& world, RegionId self, std::unique_ptr<Engine> engine)
     : impl_(std::make_unique<Impl>(world, self, std::move(engine))) {
-  AUREOLE_CHECK(self >= 0 && self < world.layout.size(), "region %d of %d", self, world.layout.size());
   // What will soon be in reach starts on one region; the exchange keeps it so.
   impl_->holdings.LoadInitialState(InitialMargin(world));
-  impl_->protocol = world.exchange.k == 0 ? MakeSyncExchange(impl_->holdings) : MakeDelayedExchange(impl_->holdings);
+  impl_->MakeProtocol();
+}
+
+Region::Region(std::unique_ptr<Impl> impl) : impl_(std::move(impl)) {}
+
+absl::StatusOr<std::unique_ptr<Region>> Region::Load(const World& world, RegionId self, std::unique_ptr<Engine> engine,
+                                                     std::string_view saved) {
+  auto impl = std::make_unique<Impl>(world, self, std::move(engine));
+  impl->MakeProtocol();
+  Reader reader(saved);
+  RegionId of = kNoRegion;
+  int regions = 0;
+  reader(of, regions);
+  if (of != self || regions != world.layout.size()) {
+    return absl::InvalidArgumentError(absl::StrCat("checkpoint: is of region ", of, " of ", regions, ", not of region ",
+                                                   self, " of ", world.layout.size()));
+  }
+  const bool loaded = impl->holdings.Load(reader);
+  if (loaded) impl->protocol->Load(reader);
+  if (!loaded || !reader.done()) {
+    return absl::InvalidArgumentError("checkpoint: is damaged, or was written by another program");
+  }
+  return std::unique_ptr<Region>(new Region(std::move(impl)));
 }
 Region::~Region() = default;
 
@@ -140,6 +166,19 @@ RegionSnapshot Region::Snapshot() const {
   h.live.due().AppendAfter(h.tick, &out.to_come);
   return out;
 }
+
+std::string Region::Save() const {
+  AUREOLE_CHECK(phase() == Phase::kBegin, "checkpoint of region %d within tick %lld", self(),
+                static_cast<long long>(tick()));
+  std::string out;
+  Writer writer(&out);
+  writer(self(), impl_->holdings.world.layout.size());
+  impl_->holdings.Save(writer);
+  impl_->protocol->Save(writer);
+  return out;
+}
+
+uint64_t Region::FramesTaken(RegionId peer) const { return impl_->holdings.inboxes.at(peer).taken(); }
 
 void Region::AppendAuras(size_t most, std::vector<WireBox>* out) const { impl_->protocol->AppendAuras(most, out); }
 

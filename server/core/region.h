@@ -15,6 +15,7 @@
 #include <cstdint>
 #include <memory>
 #include <string>
+#include <string_view>
 #include <vector>
 
 #include <absl/status/status.h>
@@ -51,6 +52,13 @@ struct RegionStats {
   // of one first met one that had not come with it. [kSlackTicks]: none within so many ticks.
   std::array<int64_t, kSlackTicks + 1> slack{};
   int64_t violations = 0;  // broken horizons (I4), each also in Region::violations()
+
+  template <class Archive>
+  void Visit(Archive& a) {
+    a(transfers_out, transfers_in, bodies_out, bodies_in, touching_out, returns_out, largest_cluster, largest_component,
+      longest_chain, auras_sent, auras_told, aura_tests, exchanges_ended_early, graphs_again, home_crossings,
+      away_bodies, slack, violations);
+  }
 };
 
 // A horizon that was broken: two bodies that were stepped apart although their exact boxes met.
@@ -97,6 +105,10 @@ class Region {
   // `engine` holds the world's environment and no dynamic body; the region loads its share of the initial state.
   // `world` outlives the region.
   Region(const World& world, RegionId self, std::unique_ptr<Engine> engine);
+  // The region that Save wrote, at the end of the tick after which it did. `engine` as above. InvalidArgument when the
+  // bytes are not of this region and world.
+  static absl::StatusOr<std::unique_ptr<Region>> Load(const World& world, RegionId self, std::unique_ptr<Engine> engine,
+                                                      std::string_view saved);
   ~Region();
   Region(const Region&) = delete;
   Region& operator=(const Region&) = delete;
@@ -141,6 +153,14 @@ class Region {
   // and the phase is kBegin. Linear in the bodies.
   RegionSnapshot Snapshot() const;
 
+  // All that decides this region's future, after a tick: given the frames of its peers that it has not taken yet, and
+  // the inputs that are offered to it from here on, a region that is loaded from this does bit for bit what this one
+  // does. Precondition: the phase is kBegin. Linear in the bodies.
+  std::string Save() const;
+  // Frames of this peer that were taken by phases since the beginning of the world, by this region and those that it
+  // was loaded from. Those that only wait are not in Save, and must come again after Load.
+  uint64_t FramesTaken(RegionId peer) const;
+
   // At most so many of the boxes that peers hold of this region's bodies, each body once, in no order. Linear in them.
   void AppendAuras(size_t most, std::vector<WireBox>* out) const;
 
@@ -160,6 +180,7 @@ class Region {
 
  private:
   struct Impl;
+  explicit Region(std::unique_ptr<Impl> impl);
   std::unique_ptr<Impl> impl_;
 };
 

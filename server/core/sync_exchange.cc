@@ -86,7 +86,16 @@ class SyncExchange final : public Protocol {
     }
   }
 
+  void Save(Writer& a) const override { const_cast<SyncExchange*>(this)->Visit(a); }
+  void Load(Reader& a) override { Visit(a); }
+
  private:
+  // What outlives a tick.
+  template <class Archive>
+  void Visit(Archive& a) {
+    a(open_, told_, remote_);
+  }
+
   struct Foreign {
     BodyId id;
     RegionId owner;
@@ -97,6 +106,11 @@ class SyncExchange final : public Protocol {
     bool by_us = false, by_them = false;
     Tick last_near = -kStayOpen;  // when a body of ours was near the peer
     bool Now() const { return by_us || by_them; }
+
+    template <class Archive>
+    void Visit(Archive& a) {
+      a(by_us, by_them, last_near);
+    }
   };
   // A contact component of own bodies; `wire` is what the others get to know of it.
   struct Component {

@@ -3,7 +3,9 @@
 #include <algorithm>
 #include <map>
 #include <memory>
+#include <optional>
 #include <set>
+#include <utility>
 
 #include <absl/strings/str_cat.h>
 
@@ -22,14 +24,16 @@ class Run {
       : s_(scenario),
         world_(scenario.world),
         faults_(faults),
+        make_engine_(make_engine),
         rng_(seed ^ 0xfa17),
+        crash_rng_(seed ^ 0xdead),
         network_(world_.layout.size(), seed, faults),
         reference_(make_engine(world_.environment)) {
     for (const BodySpec& b : world_.bodies) reference_->Spawn(b);
     for (const JointSpec& j : world_.joints) reference_->Join(j);
     const int n = world_.layout.size();
     stalled_.resize(n);
-    heard_.resize(static_cast<size_t>(n));
+    lives_.resize(static_cast<size_t>(n));
     std::map<uint64_t, Client> clients;
     for (const Input& i : s_.live) clients[i.source].inputs.push_back(i);
     for (auto& [source, client] : clients) {
@@ -51,7 +55,11 @@ class Run {
             RunRegion(to);
           },
           [this](RegionId r) {
-            stalled_[r] = false;
+            if (regions_[r] == nullptr) {
+              Restart(r);
+            } else {
+              stalled_[r] = false;
+            }
             RunRegion(r);
           });
       if (!more && checked_ < s_.ticks && verdict_.ok) Fail(checked_ + 1, "I5", "the regions wait for each other");
@@ -68,11 +76,14 @@ class Run {
   };
 
   void RunRegion(RegionId r) {
+    if (regions_[r] == nullptr) return;
     Region& region = *regions_[r];
     std::vector<Frame> out;
     while (verdict_.ok && !stalled_[r] && region.Ready()) {
+      if (faults_.crashes && crash_rng_.Chance(0.003) && MayCrash()) return Crash(r);
       if (region.phase() == Phase::kBegin) {
         if (region.tick() >= s_.ticks) return;
+        if (faults_.crashes) Checkpoint(region);
         OfferLive(region);
         if (faults_.stalls && rng_.Chance(0.01)) {
           ++verdict_.stalls;
@@ -82,7 +93,7 @@ class Run {
         }
       }
       const Tick before = region.tick();
-      if (region.phase() == Phase::kStep) Record(region, before + 1, &before_step_, &Run::CheckBeforeStep);
+      if (region.phase() == Phase::kStep) Record(region, before + 1, false);
       if (!verdict_.ok) return;
       out.clear();
       region.Advance(&out);
@@ -91,19 +102,39 @@ class Run {
         const auto frame = std::make_shared<const Frame>(std::move(f));
         for (RegionId p : frame->to) network_.Send(r, p, frame);
       }
-      if (region.tick() > before) Record(region, region.tick(), &after_step_, &Run::CheckAfterStep);
+      if (region.tick() > before) Record(region, region.tick(), true);
     }
+  }
+
+  // What was offered in a tick is durable before anybody hears of it, so after a crash it is offered in the same one.
+  void OfferLive(Region& region) {
+    Life& life = lives_[static_cast<size_t>(region.self())];
+    const Tick n = region.tick();
+    if (faults_.crashes && n <= life.offered) return;
+    life.offered = n;
+    if (n <= life.offered_ever) {
+      for (auto [i, end] = life.log.equal_range(n); i != end; ++i) Submit(region, i->second);
+    } else {
+      OfferOfClients(region);
+      if (faults_.crashes) life.offered_ever = n;
+    }
+  }
+
+  bool Submit(Region& region, const Input& input) {
+    const absl::Status s = region.Submit(input);
+    if (!s.ok()) Fail(region.tick(), "submit", std::string(s.message()));
+    return s.ok();
   }
 
   // Each client speaks to one region at a time. Now and then it goes to another, as after a lost connection, and says
   // all again there.
-  void OfferLive(Region& region) {
+  void OfferOfClients(Region& region) {
     for (size_t c = 0; c < clients_.size(); ++c) {
       Client& client = clients_[c];
       if (client.region != region.self()) continue;
       for (; client.next < client.inputs.size() && client.inputs[client.next].tick <= region.tick(); ++client.next) {
-        const absl::Status s = region.Submit(client.inputs[client.next]);
-        if (!s.ok()) return Fail(region.tick(), "submit", std::string(s.message()));
+        if (!Submit(region, client.inputs[client.next])) return;
+        lives_[static_cast<size_t>(region.self())].log.emplace(region.tick(), client.inputs[client.next]);
         if (client.next >= client.said) ++verdict_.live_inputs;
         client.said = std::max(client.said, client.next + 1);
       }
@@ -113,9 +144,60 @@ class Run {
     }
   }
 
+  // Two at once at most.
+  bool MayCrash() const { return verdict_.crashes < 8 && std::count(regions_.begin(), regions_.end(), nullptr) < 2; }
+
+  void Crash(RegionId r) {
+    ++verdict_.crashes;
+    verdict_.together += std::count(regions_.begin(), regions_.end(), nullptr);
+    regions_[r] = nullptr;
+    stalled_[r] = false;
+    network_.Down(r);
+    network_.Wake(r, static_cast<int64_t>(crash_rng_.In(1000, 300000)));
+    RegionId other = r;
+    while (other == r) other = static_cast<RegionId>(crash_rng_.Below(static_cast<int>(regions_.size())));
+    if (crash_rng_.Chance(0.3) && regions_[other] != nullptr && MayCrash()) Crash(other);
+  }
+
+  // A checkpoint is durable a while after it was taken. Until then a crash goes back to the one before.
+  void Checkpoint(const Region& region) {
+    const RegionId r = region.self();
+    Life& life = lives_[static_cast<size_t>(r)];
+    if (life.writing && region.tick() >= life.durable_at) {
+      life.durable = *std::exchange(life.writing, std::nullopt);
+      network_.Durable(r, life.durable.taken);
+    }
+    if (life.writing || !crash_rng_.Chance(0.2)) return;
+    Saved saved{region.Save(), region.tick(), life.heard, network_.SendersOf(r), {}};
+    for (RegionId peer : region.peers()) saved.taken[peer] = region.FramesTaken(peer);
+    life.writing = std::move(saved);
+    life.durable_at = region.tick() + crash_rng_.Below(8);
+  }
+
+  void Restart(RegionId r) {
+    Life& life = lives_[static_cast<size_t>(r)];
+    life.writing.reset();
+    std::unique_ptr<Engine> engine = make_engine_(world_.environment);
+    if (life.durable.state.empty()) {
+      regions_[r] = std::make_unique<Region>(world_, r, std::move(engine));
+      for (RegionId peer : regions_[r]->peers()) {
+        life.durable.taken[peer] = 0;
+        life.durable.senders[peer] = {};
+      }
+    } else {
+      absl::StatusOr<std::unique_ptr<Region>> region = Region::Load(world_, r, std::move(engine), life.durable.state);
+      AUREOLE_CHECK(region.ok(), "%s", std::string(region.status().message()).c_str());
+      regions_[r] = *std::move(region);
+    }
+    life.heard = life.durable.heard;
+    life.offered = life.durable.tick - 1;
+    if (!life.after_step.empty()) verdict_.replayed_ticks += life.after_step.rbegin()->first - life.durable.tick;
+    network_.Up(r, life.durable.senders, life.durable.taken);
+  }
+
   // All regions are told the same, in the same order.
   void TakeInputs(Region& region) {
-    size_t& heard = heard_[static_cast<size_t>(region.self())];
+    size_t& heard = lives_[static_cast<size_t>(region.self())].heard;
     for (const Input& i : region.TakeDelivered()) {
       if (heard == delivered_.size()) {
         delivered_.push_back(i);
@@ -151,9 +233,23 @@ class Run {
     }
   }
 
-  void Record(const Region& region, Tick n, std::map<Tick, Tally>* tallies, void (Run::*check)(Tick, Tally&)) {
+  // The first time that a region comes to this point of the tick counts. When it comes again after a crash, all must be
+  // as it was.
+  void Record(const Region& region, Tick n, bool stepped) {
+    std::vector<BodyRecord> records;
+    region.Observe(&records);
+    uint64_t hash = records.size();
+    for (const BodyRecord& r : records) hash += BodyHash(r.id, r.hash) * (2 * static_cast<uint64_t>(r.epoch) + 1);
+    Life& life = lives_[static_cast<size_t>(region.self())];
+    const auto [before, fresh] = (stepped ? life.after_step : life.before_step).emplace(n, hash);
+    if (!fresh) {
+      if (before->second == hash) return;
+      return Fail(n, "replay", absl::StrCat("region ", region.self(), " differs from before it died"));
+    }
+    std::map<Tick, Tally>* const tallies = stepped ? &after_step_ : &before_step_;
+    const auto check = stepped ? &Run::CheckAfterStep : &Run::CheckBeforeStep;
     Tally& t = (*tallies)[n];
-    region.Observe(&t.records);
+    t.records.insert(t.records.end(), records.begin(), records.end());
     if (++t.regions < static_cast<int>(regions_.size())) return;
     std::sort(t.records.begin(), t.records.end(), [](const BodyRecord& x, const BodyRecord& y) { return x.id < y.id; });
     (this->*check)(n, t);
@@ -264,6 +360,7 @@ class Run {
     verdict_.reconnects = network_.reconnects();
     verdict_.duplicates = network_.duplicates();
     for (const auto& r : regions_) {
+      if (r == nullptr) continue;
       const RegionStats& x = r->stats();
       verdict_.transfers += x.transfers_out;
       verdict_.touching_transfers += x.touching_out;
@@ -280,11 +377,30 @@ class Run {
   const Scenario& s_;
   const World& world_;
   const Faults faults_;
-  Random rng_;
+  const EngineFactory& make_engine_;
+  Random rng_, crash_rng_;
   Network network_;
   std::unique_ptr<Engine> reference_;
   std::vector<std::unique_ptr<Region>> regions_;
   std::vector<bool> stalled_;
+  // What is left of a region when it dies.
+  struct Saved {
+    std::string state;
+    Tick tick = 0;
+    size_t heard = 0;
+    Network::Senders senders;
+    std::map<RegionId, uint64_t> taken;
+  };
+  struct Life {
+    Saved durable;                 // state: empty before the first
+    std::optional<Saved> writing;  // durable from this tick on
+    Tick durable_at = 0;
+    std::multimap<Tick, Input> log;
+    Tick offered = -1, offered_ever = -1;              // of this life, and of any
+    size_t heard = 0;                                  // of delivered_
+    std::map<Tick, uint64_t> before_step, after_step;  // what it had, by tick
+  };
+  std::vector<Life> lives_;  // by region
   std::map<Tick, Tally> before_step_, after_step_;
   InputSchedule accepted_;
   struct Client {
@@ -294,7 +410,6 @@ class Run {
   };
   std::vector<Client> clients_;
   std::vector<Input> delivered_;             // as the first region heard them
-  std::vector<size_t> heard_;                // by region
   std::map<InputName, InputOutcome> acted_;  // in the undivided world
   std::vector<InputOutcome> outcomes_;
   std::map<BodyId, int64_t> groups_;

@@ -16,8 +16,11 @@ struct Faults {
   bool duplicates = true;
   bool reconnects = true;  // a connection is cut: what is under way is lost, the next one resumes
   bool stalls = true;      // a region stops for up to 100 ms
+  // One region, or two, lose all that they have in memory, between any two phases, and go on from their last
+  // checkpoint.
+  bool crashes = false;
 
-  static Faults None() { return {false, false, false, false, false}; }
+  static Faults None() { return {false, false, false, false, false, false}; }
 };
 
 struct Verdict {
@@ -33,6 +36,7 @@ struct Verdict {
   int64_t graphs_again = 0;  // ticks in which a box was told late (k = 0)
   int64_t spawns = 0, live_inputs = 0;
   int64_t reconnects = 0, duplicates = 0, stalls = 0;
+  int64_t crashes = 0, replayed_ticks = 0, together = 0;  // together: died while another was dead
   int64_t violations = 0;
   int64_t home_crossings = 0, away_body_ticks = 0, body_ticks = 0;
   uint64_t hash = 0;  // of the last state

@@ -21,6 +21,7 @@ struct Totals {
   int64_t seeds = 0, bad = 0, over_100_touching = 0;
   int64_t transfers = 0, touching = 0, returns = 0, wakes = 0, spawns = 0, live = 0;
   int64_t reconnects = 0, duplicates = 0, stalls = 0, violations = 0, graphs_again = 0;
+  int64_t crashes = 0, replayed = 0, together = 0;
   int64_t largest_cluster = 0;
   std::map<int64_t, int64_t> chains;  // longest chain -> seeds
   std::map<std::string, int64_t> kinds;
@@ -45,6 +46,9 @@ void Add(const Scenario& s, const Verdict& v, Totals* t) {
   t->reconnects += v.reconnects;
   t->duplicates += v.duplicates;
   t->stalls += v.stalls;
+  t->crashes += v.crashes;
+  t->replayed += v.replayed_ticks;
+  t->together += v.together;
   t->violations += v.violations;
   t->graphs_again += v.graphs_again;
   t->largest_cluster = std::max(t->largest_cluster, v.largest_cluster);
@@ -117,19 +121,25 @@ int RunAll(const Options& o) {
   std::printf("  reconnects %lld, duplicates %lld, stalls %lld, broken horizons %lld\n",
               static_cast<long long>(totals.reconnects), static_cast<long long>(totals.duplicates),
               static_cast<long long>(totals.stalls), static_cast<long long>(totals.violations));
+  if (o.faults.crashes) {
+    std::printf("  crashes %lld, while another was dead %lld, ticks replayed %lld\n",
+                static_cast<long long>(totals.crashes), static_cast<long long>(totals.together),
+                static_cast<long long>(totals.replayed));
+  }
   std::printf("  hash %016llx\n", static_cast<unsigned long long>(totals.hash));
   return totals.bad == 0 ? 0 : 1;
 }
 
 bool ParseFaults(const std::string& list, Faults* f) {
-  if (list == "all") return true;
+  if (list == "all") {
+    f->crashes = true;
+    return true;
+  }
   *f = Faults::None();
   if (list == "none") return true;
-  const std::map<std::string, bool*> names{{"delay", &f->delay},
-                                           {"jitter", &f->jitter},
-                                           {"duplicates", &f->duplicates},
-                                           {"reconnects", &f->reconnects},
-                                           {"stalls", &f->stalls}};
+  const std::map<std::string, bool*> names{{"delay", &f->delay},           {"jitter", &f->jitter},
+                                           {"duplicates", &f->duplicates}, {"reconnects", &f->reconnects},
+                                           {"stalls", &f->stalls},         {"crashes", &f->crashes}};
   for (const std::string& name : CLI::detail::split(list, ',')) {
     auto it = names.find(name);
     if (it == names.end()) return false;
@@ -155,7 +165,7 @@ int Main(int argc, char** argv) {
   app.add_option("--seeds", o.seeds, "number of seeds")->check(CLI::PositiveNumber);
   app.add_option("--first", o.first, "first seed");
   app.add_flag("--toy", o.scenario.toy, "the toy engine instead of Bullet");
-  app.add_option("--faults", faults, "all, none, or a list of delay,jitter,duplicates,reconnects,stalls");
+  app.add_option("--faults", faults, "all, none, or a list of delay,jitter,duplicates,reconnects,stalls,crashes");
   app.add_option("--k", k, "delay of the exchange in ticks (default: by seed)")->check(CLI::Range(0, 3));
   app.add_option("--policy", policy, "tolerance or reach (default: by seed)")
       ->check(CLI::IsMember({"tolerance", "reach"}));

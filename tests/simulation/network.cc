@@ -1,5 +1,7 @@
 #include "tests/simulation/network.h"
 
+#include "server/core/check.h"
+
 namespace aureole::sim {
 
 Network::Network(int regions, uint64_t seed, const Faults& faults) : faults_(faults), rng_(seed ^ 0x5eed) {
@@ -25,10 +27,45 @@ void Network::Send(RegionId from, RegionId to, std::shared_ptr<const Frame> fram
   }
   if (faults_.reconnects && rng_.Chance(0.01)) {
     ++reconnects_;
-    ++link.connection;
-    Push({now_us_ + static_cast<int64_t>(rng_.In(0, 50000)), 0, Event::Kind::kReconnect, from, to, link.connection, 0,
-          nullptr});
+    Reconnect(from, to);
   }
+}
+
+void Network::Reconnect(RegionId from, RegionId to) {
+  const uint64_t connection = ++links_.at({from, to}).connection;
+  Push({now_us_ + static_cast<int64_t>(rng_.In(0, 50000)), 0, Event::Kind::kReconnect, from, to, connection, 0,
+        nullptr});
+}
+
+void Network::Down(RegionId region) {
+  down_.insert(region);
+  for (auto& [ends, link] : links_) {
+    if (ends.first == region || ends.second == region) ++link.connection;
+  }
+}
+
+Network::Senders Network::SendersOf(RegionId region) const {
+  Senders out;
+  for (const auto& [ends, link] : links_) {
+    if (ends.first == region) out[ends.second] = link.sender;
+  }
+  return out;
+}
+
+void Network::Up(RegionId region, const Senders& senders, const std::map<RegionId, uint64_t>& taken) {
+  down_.erase(region);
+  for (const auto& [peer, sender] : senders) {
+    links_.at({region, peer}).sender = sender;
+    Reconnect(region, peer);
+  }
+  for (const auto& [peer, frames] : taken) {
+    links_.at({peer, region}).receiver = LinkReceiver(frames);
+    Reconnect(peer, region);
+  }
+}
+
+void Network::Durable(RegionId region, const std::map<RegionId, uint64_t>& taken) {
+  for (const auto& [peer, frames] : taken) links_.at({peer, region}).sender.Acknowledge(frames);
 }
 
 void Network::Transmit(RegionId from, RegionId to, uint64_t sequence, const std::shared_ptr<const Frame>& frame) {
@@ -55,9 +92,11 @@ bool Network::RunNext(const std::function<void(RegionId, const Frame&)>& deliver
     return true;
   }
   Link& link = links_.at({e.from, e.to});
-  if (e.connection != link.connection) return true;  // lost with its connection
+  if (e.connection != link.connection || down_.contains(e.to) || down_.contains(e.from)) return true;  // lost
   if (e.kind == Event::Kind::kReconnect) {
     link.last_arrival_us = now_us_;
+    AUREOLE_CHECK(link.sender.first() <= link.receiver.applied() + 1, "region %d no longer has what region %d needs",
+                  e.from, e.to);
     link.sender.Resume(link.receiver.applied(), [&](uint64_t sequence, const std::shared_ptr<const Frame>& frame) {
       Transmit(e.from, e.to, sequence, frame);
     });
@@ -67,7 +106,7 @@ bool Network::RunNext(const std::function<void(RegionId, const Frame&)>& deliver
     case LinkReceiver::Verdict::kApply:
       deliver(e.to, *e.frame);
       // The acknowledgement may take its time: what is kept too long does no harm.
-      if (rng_.Chance(0.5)) link.sender.Acknowledge(link.receiver.applied());
+      if (rng_.Chance(0.5) && !faults_.crashes) link.sender.Acknowledge(link.receiver.applied());
       break;
     case LinkReceiver::Verdict::kDuplicate:
       break;

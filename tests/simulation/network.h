@@ -6,6 +6,7 @@
 #include <map>
 #include <memory>
 #include <queue>
+#include <set>
 #include <vector>
 
 #include "server/core/frame.h"
@@ -26,6 +27,16 @@ class Network {
   // way.
   bool RunNext(const std::function<void(RegionId to, const Frame&)>& deliver,
                const std::function<void(RegionId)>& wake);
+
+  // A region dies: what is under way to and from it is lost, and nothing more reaches it.
+  void Down(RegionId region);
+  // Of a region: what it keeps for each peer.
+  using Senders = std::map<RegionId, LinkSender<std::shared_ptr<const Frame>>>;
+  Senders SendersOf(RegionId region) const;
+  // It is back: it goes on with what it kept then, and has taken so many frames of each peer.
+  void Up(RegionId region, const Senders& senders, const std::map<RegionId, uint64_t>& taken);
+  // With crashes, frames are kept until the receiver says that they are durable there.
+  void Durable(RegionId region, const std::map<RegionId, uint64_t>& taken);
 
   int64_t reconnects() const { return reconnects_; }
   int64_t duplicates() const { return duplicates_; }
@@ -48,11 +59,13 @@ class Network {
   };
 
   void Transmit(RegionId from, RegionId to, uint64_t sequence, const std::shared_ptr<const Frame>& frame);
+  void Reconnect(RegionId from, RegionId to);
   void Push(Event e);
 
   Faults faults_;
   Random rng_;
   std::map<std::pair<RegionId, RegionId>, Link> links_;
+  std::set<RegionId> down_;
   std::priority_queue<Event, std::vector<Event>, std::greater<>> events_;
   int64_t now_us_ = 0;
   uint64_t order_ = 0;

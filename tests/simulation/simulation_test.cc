@@ -2,6 +2,7 @@
 #include <gtest/gtest.h>
 
 #include "server/core/toy_engine.h"
+#include "server/physics/bullet_engine.h"
 #include "tests/simulation/cluster.h"
 
 namespace aureole::sim {
@@ -10,14 +11,15 @@ namespace {
 // Runs seeds until one is bad; adds up what they went through.
 struct Sum {
   int64_t bad = 0, touching = 0, chains_of_3 = 0, chains_of_4 = 0, wakes = 0, returns = 0, reconnects = 0;
-  int64_t graphs_again = 0;
+  int64_t graphs_again = 0, crashes = 0, replayed = 0, together = 0;
   std::string first;
 };
-Sum RunSeeds(uint64_t first, int seeds, const ScenarioOptions& options, const Faults& faults, bool stop = true) {
+Sum RunSeeds(uint64_t first, int seeds, const ScenarioOptions& options, const Faults& faults, bool stop = true,
+             const EngineFactory& make_engine = MakeToyEngine) {
   Sum sum;
   for (uint64_t seed = first; seed < first + static_cast<uint64_t>(seeds); ++seed) {
-    const Scenario s = MakeScenario(seed, options, MakeToyEngine);
-    const Verdict v = RunCluster(s, seed, faults, MakeToyEngine);
+    const Scenario s = MakeScenario(seed, options, make_engine);
+    const Verdict v = RunCluster(s, seed, faults, make_engine);
     sum.bad += !v.ok;
     sum.touching += v.touching_transfers;
     sum.chains_of_3 += v.longest_chain >= 3;
@@ -26,6 +28,9 @@ Sum RunSeeds(uint64_t first, int seeds, const ScenarioOptions& options, const Fa
     sum.returns += v.returns;
     sum.reconnects += v.reconnects;
     sum.graphs_again += v.graphs_again;
+    sum.crashes += v.crashes;
+    sum.replayed += v.replayed_ticks;
+    sum.together += v.together;
     if (!v.ok) {
       sum.first =
           "seed " + std::to_string(seed) + " tick " + std::to_string(v.tick) + " " + v.invariant + ": " + v.message;
@@ -93,6 +98,25 @@ TEST(ClusterSimulation, TheNetworkChangesNoBit) {
     EXPECT_EQ(calm.hash, rough.hash) << "seed " << seed;
     EXPECT_EQ(calm.transfers, rough.transfers) << "seed " << seed;
   }
+}
+
+// A region is a pure function of its checkpoint, the frames of its peers and its inputs: it replays what it lost.
+TEST(ClusterSimulation, RegionsThatDieBetweenAnyTwoPhasesGoOnBitForBit) {
+  Faults faults;
+  faults.crashes = true;
+  const Sum sum = RunSeeds(20000, 400, {}, faults);
+  EXPECT_EQ(sum.bad, 0) << sum.first;
+  EXPECT_GT(sum.crashes, 2000);
+  EXPECT_GT(sum.together, 400);
+  EXPECT_GT(sum.replayed, 15000);
+}
+
+TEST(ClusterSimulation, BulletRegionsThatDieGoOnBitForBit) {
+  Faults faults;
+  faults.crashes = true;
+  const Sum sum = RunSeeds(21000, 12, {}, faults, true, MakeBulletEngine);
+  EXPECT_EQ(sum.bad, 0) << sum.first;
+  EXPECT_GT(sum.crashes, 40);
 }
 
 // Where three regions lie side by side, strangers of the outer two meet deep in the middle one: m = 2 is not enough on

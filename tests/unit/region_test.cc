@@ -37,6 +37,23 @@ World TwoColumns() {
 
 int64_t AurasSent(Lockstep& s) { return s.region(0).stats().auras_sent + s.region(1).stats().auras_sent; }
 
+TEST(Region, CheckpointOfAnotherRegionOrDamagedIsRefused) {
+  World w = TwoColumns();
+  w.bodies = {Ball(1, -0.5, 1), Ball(2, 0.2, -1), Ball(3, 4)};
+  Lockstep s(w);
+  s.RunTo(30);
+  const std::string saved = s.region(0).Save();
+  const auto load = [&w](RegionId self, const std::string& bytes) {
+    return Region::Load(w, self, MakeToyEngine(w.environment), bytes).status();
+  };
+  EXPECT_TRUE(load(0, saved).ok());
+  EXPECT_THAT(std::string(load(1, saved).message()), HasSubstr("is of region 0 of 2, not of region 1 of 2"));
+  EXPECT_THAT(std::string(load(0, saved + "x").message()), HasSubstr("damaged"));
+  for (size_t n = 8; n < saved.size(); ++n) {
+    EXPECT_THAT(std::string(load(0, saved.substr(0, n)).message()), HasSubstr("damaged")) << n;
+  }
+}
+
 TEST(Region, BodyFarFromTheBorderCostsNoAuraTestAndNoByte) {
   World w = TwoColumns();
   for (BodyId id = 1; id <= 50; ++id) w.bodies.push_back(Ball(id, -100.0 - static_cast<double>(id), 0.5));
@@ -231,7 +248,7 @@ TEST(Region, FrameOfAStrangerIsRefusedWithAReasonAndChangesNothing) {
   f.to = {1};
   EXPECT_THAT(std::string(s.region(0).Receive(f).message()), HasSubstr("frame.to"));
   f.to = {0};
-  f.tick = 9;
+  f.tick = 1 << 15;
   EXPECT_THAT(std::string(s.region(0).Receive(f).message()), HasSubstr("too far ahead"));
   f.tick = 3;
   EXPECT_THAT(std::string(s.region(0).Receive(f).message()), HasSubstr("cannot follow"));
