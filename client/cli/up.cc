@@ -176,6 +176,13 @@ CLI::App* AddUp(CLI::App& app, UpOptions* o) {
   up->add_flag("--json", o->json, "Print one JSON object at the end and nothing else");
   up->add_flag("--verbose", o->verbose, "Repeat the servers' logs on stderr");
   up->add_option("--logs", o->logs, "Keep the servers' logs in this directory")->type_name("DIR");
+  up->add_option("--data", o->data, "Keep the regions' checkpoints in this directory; beside the logs when not given")
+      ->type_name("DIR");
+  up->add_option("--checkpoint-every", o->checkpoint_s,
+                 "Seconds of simulated time between checkpoints, from which a server that dies is replaced; 0 for none")
+      ->check(CLI::Range(0.0, 3600.0))
+      ->capture_default_str()
+      ->type_name("SECONDS");
   up->add_option("--region-server", o->region_server, "Program to start; aureole-region beside this one when not given")
       ->type_name("FILE");
   up->add_option("--viewer", o->viewer,
@@ -207,11 +214,14 @@ int Up(const UpOptions& options) {
   run.last_tick = heading.last_tick;
   run.hash_every = options.hash_every >= 0 ? options.hash_every : heading.last_tick > 0 ? kDefaultHashEvery : 0;
 
-  LocalAllocator allocator({options.region_server, options.logs, options.verbose});
+  run.checkpoint_every = TicksIn(options.checkpoint_s, heading.tick_us);
+
+  LocalAllocator allocator({options.region_server, options.logs, options.verbose, options.data});
   Display display(heading, options.json, options.viewer);
   RunResult result;
   const absl::Status status = RunWorld(
-      run, allocator, [&display](const RunStatus& now) { return display.Show(now) && Interrupts() == 0; }, &result);
+      run, allocator, [&display](const RunStatus& now) { return display.Show(now) && Interrupts() == 0; }, &result,
+      [](const RunEvent& event) { std::cerr << "aureole: region " << event.region << ": " << event.what << '\n'; });
 
   if (options.json) {
     std::cout << ResultJson(heading, options, status, result).dump(2) << std::endl;

@@ -15,8 +15,9 @@ struct UpOptions {
   bool undivided = false;
   bool verbose = false;
   int64_t hash_every = -1;  // ticks; -1: 100 when there is a duration, else none
-  std::string logs, region_server;
-  std::string viewer;  // directory of the browser viewer; empty: none
+  std::string logs, data, region_server;
+  double checkpoint_s = 1;  // 0: none
+  std::string viewer;       // directory of the browser viewer; empty: none
 };
 
 // Adds the command to `app`; `options` outlives it.

@@ -2,6 +2,7 @@
 // them as threads; a cluster's scheduler is the next one.
 #pragma once
 
+#include <cstdint>
 #include <string>
 #include <vector>
 
@@ -13,12 +14,14 @@ namespace aureole {
 
 struct ServerStart {
   RegionId region = kNoRegion;
-  std::string token;    // what the server says in its Hello
-  std::string control;  // where it says it, host:port
+  uint64_t incarnation = 1;  // grows with every server of the region
+  std::string token;         // what the server says in its Hello
+  std::string control;       // where it says it, host:port
 };
 
 struct ServerExit {
   RegionId region = kNoRegion;
+  uint64_t incarnation = 1;
   bool clean = false;    // exit status 0
   std::string how;       // "exit status 3", "killed by signal 9 (Killed)"
   std::string log;       // where all that it wrote is kept; empty when nowhere
@@ -36,6 +39,8 @@ class Allocator {
   // Servers that ended since the last call. Call it several times a second.
   virtual std::vector<ServerExit> Poll() = 0;
   virtual int running() const = 0;
+  // Ends one server at once, whatever it does; it is told of by Poll. Nothing when there is none.
+  virtual void End(RegionId region, uint64_t incarnation) = 0;
   // Ends every server at once, without a chance to say goodbye, and waits until all are gone.
   virtual void Kill() = 0;
 };

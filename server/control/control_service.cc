@@ -76,7 +76,10 @@ class ControlService::Session final : public grpc::ServerBidiReactor<v1::FromReg
 };
 
 ControlService::ControlService(RunPlan plan) : plan_(std::move(plan)), regions_(plan_.tokens.size()) {
-  for (RegionRecord& record : regions_) record.status.reported = std::chrono::steady_clock::now();
+  for (size_t i = 0; i < regions_.size(); ++i) {
+    regions_[i].token = plan_.tokens[i];
+    regions_[i].status.reported = std::chrono::steady_clock::now();
+  }
 }
 
 ControlService::~ControlService() {
@@ -139,9 +142,10 @@ void ControlService::Stop(const std::string& reason) {
 void ControlService::Leave(Session* session) {
   const std::lock_guard lock(mutex_);
   --sessions_;
-  if (session->region != kNoRegion) {
+  if (session->region != kNoRegion && regions_[session->region].session == session) {
     regions_[session->region].session = nullptr;
     regions_[session->region].status.left = true;
+    regions_[session->region].status.reported = std::chrono::steady_clock::now();
   }
   Changed();
 }
@@ -151,9 +155,10 @@ absl::Status ControlService::Handle(Session* session, const v1::FromRegion& mess
   if (message.has_hello()) return HandleHello(session, message.hello());
   if (session->region == kNoRegion) return absl::FailedPreconditionError("the first message must be a Hello");
   RegionRecord* record = &regions_[session->region];
+  if (record->session != session) return absl::FailedPreconditionError("this server has been replaced");
   switch (message.message_case()) {
     case v1::FromRegion::kReady:
-      return HandleReady(record, message.ready());
+      return HandleReady(session->region, message.ready());
     case v1::FromRegion::kReport:
       return HandleReport(record, message.report());
     case v1::FromRegion::kGoodbye:
@@ -172,12 +177,13 @@ absl::Status ControlService::HandleHello(Session* session, const v1::Hello& hell
                                                       "; use the region server of this release"));
   }
   if (hello.endpoint().empty()) return absl::InvalidArgumentError("hello.endpoint: is empty; give host:port");
-  const auto token = std::find(plan_.tokens.begin(), plan_.tokens.end(), hello.token());
-  if (token == plan_.tokens.end() || hello.token().empty()) {
-    return absl::UnauthenticatedError("hello.token: is not one of this run");
+  const auto found = std::find_if(regions_.begin(), regions_.end(),
+                                  [&hello](const RegionRecord& r) { return r.token == hello.token(); });
+  if (found == regions_.end() || hello.token().empty()) {
+    return absl::UnauthenticatedError("hello.token: is not one of this run, or of a server that has been replaced");
   }
-  const RegionId region = static_cast<RegionId>(token - plan_.tokens.begin());
-  RegionRecord& record = regions_[region];
+  const RegionId region = static_cast<RegionId>(found - regions_.begin());
+  RegionRecord& record = *found;
   if (record.status.joined) {
     return absl::AlreadyExistsError(absl::StrCat("hello.token: region ", region, " has joined already"));
   }
@@ -187,36 +193,93 @@ absl::Status ControlService::HandleHello(Session* session, const v1::Hello& hell
   record.status.endpoint = hello.endpoint();
   record.status.metrics_endpoint = hello.metrics_endpoint();
   record.status.pid = hello.pid();
-  if (std::all_of(regions_.begin(), regions_.end(), [](const RegionRecord& r) { return r.status.joined; })) AssignAll();
+  record.status.reported = std::chrono::steady_clock::now();
+  if (stage_ != Stage::kJoining) {
+    Assign(region);
+  } else if (std::all_of(regions_.begin(), regions_.end(), [](const RegionRecord& r) { return r.status.joined; })) {
+    AssignAll();
+  }
   Changed();
   return absl::OkStatus();
 }
 
 void ControlService::AssignAll() {
   stage_ = Stage::kLoading;
+  for (size_t i = 0; i < regions_.size(); ++i) Assign(static_cast<RegionId>(i));
+}
+
+void ControlService::Assign(RegionId region) {
+  RegionRecord& to = regions_[region];
+  if (to.session == nullptr) return;
   v1::ToRegion message;
   v1::Assignment* a = message.mutable_assignment();
   *a->mutable_world() = plan_.world;
-  for (const RegionRecord& record : regions_) a->add_endpoints(record.status.endpoint);
+  for (const RegionRecord& record : regions_) {
+    a->add_endpoints(record.status.endpoint);
+    a->add_incarnations(record.status.incarnation);
+  }
+  a->set_region(region);
   a->set_layout_epoch(1);
-  a->set_incarnation(1);
+  a->set_incarnation(to.status.incarnation);
+  a->set_checkpoint_every(plan_.checkpoint_every);
+  a->set_recover(to.was_ready);
   a->set_undivided(plan_.undivided);
   a->set_no_real_time(plan_.no_real_time);
   a->set_last_tick(plan_.last_tick);
   a->set_hash_every(plan_.hash_every);
+  to.assigned = true;
+  to.session->Send(std::move(message));
+}
+
+void ControlService::Expect(RegionId region, uint64_t incarnation, const std::string& token) {
+  const std::lock_guard lock(mutex_);
+  RegionRecord& record = regions_[region];
+  if (record.session != nullptr) {
+    record.session->Close({grpc::StatusCode::FAILED_PRECONDITION, "this server has been replaced"});
+  }
+  record.session = nullptr;
+  record.token = token;
+  record.assigned = false;
+  record.recent.clear();
+  RegionStatus& status = record.status;
+  status.incarnation = incarnation;
+  status.joined = status.ready = status.finished = status.left = false;
+  status.goodbye.clear();
+  status.pid = 0;
+  status.reported = std::chrono::steady_clock::now();
+  Changed();
+}
+
+// A server that was told the endpoint before it was there has to find the new one.
+void ControlService::TellMoved(RegionId region) {
+  v1::ToRegion message;
+  v1::PeerMoved* moved = message.mutable_peer_moved();
+  moved->set_region(region);
+  moved->set_endpoint(regions_[region].status.endpoint);
+  moved->set_incarnation(regions_[region].status.incarnation);
   for (size_t i = 0; i < regions_.size(); ++i) {
-    a->set_region(static_cast<int32_t>(i));
-    if (regions_[i].session != nullptr) regions_[i].session->Send(message);
+    const bool told = regions_[i].assigned && static_cast<RegionId>(i) != region;
+    if (told && regions_[i].session != nullptr) regions_[i].session->Send(message);
   }
 }
 
-absl::Status ControlService::HandleReady(RegionRecord* record, const v1::Ready& ready) {
-  if (stage_ != Stage::kLoading || record->status.ready) {
+absl::Status ControlService::HandleReady(RegionId region, const v1::Ready& ready) {
+  RegionRecord* const record = &regions_[region];
+  if (!record->assigned || record->status.ready) {
     return absl::FailedPreconditionError("a Ready before the Assignment, or a second one");
   }
   record->status.ready = true;
+  record->was_ready = true;
+  record->session_hash = -1;
   record->status.report.set_bodies(ready.bodies());
-  if (std::all_of(regions_.begin(), regions_.end(), [](const RegionRecord& r) { return r.status.ready; })) StartAll();
+  record->status.report.set_tick(ready.tick());
+  record->status.report.clear_waiting_for();
+  if (record->status.incarnation > 1) TellMoved(region);
+  if (stage_ == Stage::kRunning) {
+    Start(record);
+  } else if (std::all_of(regions_.begin(), regions_.end(), [](const RegionRecord& r) { return r.status.ready; })) {
+    StartAll();
+  }
   Changed();
   return absl::OkStatus();
 }
@@ -224,13 +287,15 @@ absl::Status ControlService::HandleReady(RegionRecord* record, const v1::Ready& 
 void ControlService::StartAll() {
   stage_ = Stage::kRunning;
   const auto start = std::chrono::system_clock::now() + plan_.start_delay;
+  start_unix_us_ = std::chrono::duration_cast<std::chrono::microseconds>(start.time_since_epoch()).count();
+  for (RegionRecord& record : regions_) Start(&record);
+}
+
+void ControlService::Start(RegionRecord* record) {
+  record->status.reported = std::chrono::steady_clock::now();
   v1::ToRegion message;
-  message.mutable_start()->set_start_unix_us(
-      std::chrono::duration_cast<std::chrono::microseconds>(start.time_since_epoch()).count());
-  for (RegionRecord& record : regions_) {
-    record.status.reported = std::chrono::steady_clock::now();
-    if (record.session != nullptr) record.session->Send(message);
-  }
+  message.mutable_start()->set_start_unix_us(start_unix_us_);
+  if (record->session != nullptr) record->session->Send(std::move(message));
 }
 
 absl::Status ControlService::HandleReport(RegionRecord* record, const v1::Report& report) {
@@ -242,13 +307,15 @@ absl::Status ControlService::HandleReport(RegionRecord* record, const v1::Report
     return absl::InvalidArgumentError(
         absl::StrCat("report.tick: is ", report.tick(), " after ", status.report.tick(), "; time does not run back"));
   }
-  Tick last_hash = record->last_hash;
+  Tick last_hash = record->session_hash;
   for (const v1::TickHash& h : report.hashes()) {
     if (h.tick() <= last_hash) return absl::InvalidArgumentError("report.hashes: ticks must ascend");
     last_hash = h.tick();
   }
-  record->last_hash = last_hash;
+  record->session_hash = last_hash;
   for (const v1::TickHash& h : report.hashes()) {
+    if (h.tick() <= record->last_hash) continue;  // the server before it has said so
+    record->last_hash = h.tick();
     TickSum& sum = hashes_[h.tick()];
     sum.tick = h.tick();
     sum.hash += h.hash();

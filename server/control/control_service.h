@@ -26,6 +26,7 @@ struct RunPlan {
   std::vector<std::string> tokens;  // one per region; what a server says to be that region
   bool undivided = false;           // one region, whatever the layout says; then there is one token
   bool no_real_time = false;
+  Tick checkpoint_every = 0;                   // ticks; 0: none, and no region can be replaced
   Tick last_tick = 0;                          // 0: no end
   Tick hash_every = 0;                         // ticks; 0: never
   std::chrono::milliseconds start_delay{300};  // from the last Ready to tick 0
@@ -48,6 +49,9 @@ class ControlService final : public v1::Control::CallbackService {
   std::vector<v1::Violation> Violations() const;
   // Returns when something other than a plain report has happened since the last call, or after `longest`.
   void Wait(std::chrono::milliseconds longest);
+  // The region's next server has this incarnation and token. An older one that is still here must leave. Any time; the
+  // plan's tokens are those of incarnation 1.
+  void Expect(RegionId region, uint64_t incarnation, const std::string& token);
   // Tells every server that is here to end.
   void Stop(const std::string& reason);
 
@@ -56,19 +60,25 @@ class ControlService final : public v1::Control::CallbackService {
   struct RegionRecord {
     RegionStatus status;
     Session* session = nullptr;
+    std::string token;
+    bool assigned = false;   // the server that is here
+    bool was_ready = false;  // some server of it was: there is a checkpoint
     std::deque<v1::FrameTime> recent;
     std::deque<v1::Window> windows;
-    Tick last_hash = -1;
+    Tick last_hash = -1, session_hash = -1;  // reported, ever and by this server
   };
 
   // Handles one message of a session; an error ends the session and changes nothing else.
   absl::Status Handle(Session* session, const v1::FromRegion& message);
   absl::Status HandleHello(Session* session, const v1::Hello& hello);
-  absl::Status HandleReady(RegionRecord* record, const v1::Ready& ready);
+  absl::Status HandleReady(RegionId region, const v1::Ready& ready);
   absl::Status HandleReport(RegionRecord* record, const v1::Report& report);
   void Leave(Session* session);
   void AssignAll();
+  void Assign(RegionId region);
   void StartAll();
+  void Start(RegionRecord* record);
+  void TellMoved(RegionId region);
   void Changed();
 
   const RunPlan plan_;
@@ -77,6 +87,7 @@ class ControlService final : public v1::Control::CallbackService {
   uint64_t changes_ = 0, seen_ = 0;
   int sessions_ = 0;  // alive
   Stage stage_ = Stage::kJoining;
+  int64_t start_unix_us_ = 0;  // once running
   std::vector<RegionRecord> regions_;
   std::map<Tick, TickSum> hashes_;
   std::vector<v1::Violation> violations_;

@@ -111,12 +111,21 @@ absl::Status LocalAllocator::Start(const ServerStart& start) {
   }
   const std::string executable = options_.executable.string();
   const std::string path = LogFile(start.region).string();
-  const int log = open(path.c_str(), O_WRONLY | O_CREAT | O_TRUNC | O_APPEND | O_CLOEXEC, 0644);
+  const bool first = std::none_of(logs_.begin(), logs_.end(), [&](const Log& l) { return l.region == start.region; });
+  const int log = open(path.c_str(), O_WRONLY | O_CREAT | (first ? O_TRUNC : 0) | O_APPEND | O_CLOEXEC, 0644);
   if (log < 0) return absl::InternalError(absl::StrCat("cannot write ", path, ": ", std::strerror(errno)));
   const int null = open("/dev/null", O_RDONLY | O_CLOEXEC);
 
-  std::vector<std::string> words = {executable, "--control", start.control,
-                                    "--token",  start.token, "--exit-with-parent"};
+  const std::filesystem::path& data =
+      options_.data_directory.empty() ? options_.log_directory : options_.data_directory;
+  std::vector<std::string> words = {executable,
+                                    "--control",
+                                    start.control,
+                                    "--token",
+                                    start.token,
+                                    "--data",
+                                    (data / absl::StrCat("region-", start.region)).string(),
+                                    "--exit-with-parent"};
   std::vector<char*> arguments;
   for (std::string& word : words) arguments.push_back(word.data());
   arguments.push_back(nullptr);
@@ -132,8 +141,8 @@ absl::Status LocalAllocator::Start(const ServerStart& start) {
         absl::StrCat("cannot start the server of region ", start.region, ": ", std::strerror(fork_error)));
   }
   setpgid(pid, pid);  // in both processes, so that Kill never comes too early for the group
-  children_.push_back({start.region, pid});
-  logs_.push_back({start.region, 0});
+  children_.push_back({start.region, start.incarnation, pid});
+  if (first) logs_.push_back({start.region, 0});
   return absl::OkStatus();
 }
 
@@ -156,6 +165,7 @@ std::vector<ServerExit> LocalAllocator::Poll() {
 ServerExit LocalAllocator::Describe(const Child& child, int wait_status) {
   ServerExit exit;
   exit.region = child.region;
+  exit.incarnation = child.incarnation;
   if (WIFSIGNALED(wait_status)) {
     const int number = WTERMSIG(wait_status);
     exit.how = absl::StrCat("killed by signal ", number, " (", strsignal(number), ")");
@@ -169,6 +179,12 @@ ServerExit LocalAllocator::Describe(const Child& child, int wait_status) {
     exit.log_tail = TailOfFile(exit.log, kTailLines);
   }
   return exit;
+}
+
+void LocalAllocator::End(RegionId region, uint64_t incarnation) {
+  for (const Child& child : children_) {
+    if (child.region == region && child.incarnation == incarnation) kill(-child.pid, SIGKILL);
+  }
 }
 
 void LocalAllocator::Kill() {

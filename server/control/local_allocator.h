@@ -23,6 +23,8 @@ class LocalAllocator final : public Allocator {
     std::filesystem::path log_directory;
     // Repeats what the servers log on stderr, each line after its region.
     bool verbose = false;
+    // Where servers keep checkpoints, a directory for each region; made when missing and kept. Empty: beside the logs.
+    std::filesystem::path data_directory = {};
   };
   explicit LocalAllocator(Options options);
   ~LocalAllocator() override;
@@ -32,6 +34,7 @@ class LocalAllocator final : public Allocator {
   absl::Status Start(const ServerStart& start) override;
   std::vector<ServerExit> Poll() override;
   int running() const override { return static_cast<int>(children_.size()); }
+  void End(RegionId region, uint64_t incarnation) override;
   void Kill() override;
 
   std::filesystem::path LogFile(RegionId region) const;
@@ -41,6 +44,7 @@ class LocalAllocator final : public Allocator {
  private:
   struct Child {
     RegionId region = kNoRegion;
+    uint64_t incarnation = 1;
     pid_t pid = 0;
   };
   struct Log {
@@ -54,7 +58,7 @@ class LocalAllocator final : public Allocator {
   Options options_;
   bool temporary_ = false;  // options_.log_directory is ours to remove
   bool bad_exit_ = false;
-  std::vector<Child> children_;  // running, ascending by region
+  std::vector<Child> children_;  // running
   std::vector<Log> logs_;
 };
 

@@ -25,6 +25,7 @@ int main(int argc, char** argv) {
       "Example:\n  aureole-control tests/worlds/demo.json --listen 127.0.0.1:7000\n\n"
       "Exit codes: 0 it ran, 1 the run failed, 2 bad input (then nothing was started).");
   std::string world_path, duration;
+  double checkpoint_s = 1;
   aureole::RunOptions options;
   aureole::LocalAllocator::Options servers;
   app.add_option("world", world_path, "World file (JSON)")->required();
@@ -36,6 +37,10 @@ int main(int argc, char** argv) {
   app.add_flag("--no-real-time", options.no_real_time, "As fast as it can");
   app.add_option("--region-server", servers.executable, "Program to start; beside this one when not given");
   app.add_option("--logs", servers.log_directory, "Directory for the servers' logs; kept");
+  app.add_option("--data", servers.data_directory, "Directory for checkpoints; beside the logs when not given");
+  app.add_option("--checkpoint-every", checkpoint_s, "Seconds of simulated time between checkpoints; 0 for none")
+      ->check(CLI::Range(0.0, 3600.0))
+      ->capture_default_str();
   try {
     app.parse(argc, argv);
   } catch (const CLI::ParseError& e) {
@@ -57,6 +62,8 @@ int main(int argc, char** argv) {
   const int64_t tick_us = file->world.environment.tick_us;
   if (!duration.empty()) options.last_tick = aureole::TicksIn(absl::ToDoubleSeconds(length), tick_us);
 
+  options.checkpoint_every = aureole::TicksIn(checkpoint_s, tick_us);
+
   servers.verbose = true;
   aureole::LocalAllocator allocator(servers);
   aureole::RunResult result;
@@ -72,7 +79,10 @@ int main(int argc, char** argv) {
         }
         return aureole::Interrupts() == 0;
       },
-      &result);
+      &result,
+      [](const aureole::RunEvent& event) {
+        std::cerr << "[control] region " << event.region << ": " << event.what << '\n';
+      });
   if (!status.ok() && !absl::IsCancelled(status)) {
     std::cerr << "[control] " << status.message() << '\n';
     return kFailed;

@@ -12,6 +12,7 @@
 #include <absl/strings/str_split.h>
 
 #include "server/control/interrupts.h"
+#include "server/control/reconcile.h"
 
 namespace aureole {
 namespace {
@@ -20,13 +21,13 @@ using Clock = std::chrono::steady_clock;
 
 constexpr std::chrono::milliseconds kPollEvery{50};
 constexpr std::chrono::milliseconds kObserveEvery{100};
-// A server whose stream has ended has this long to end too, so that its own exit can be the message.
-constexpr std::chrono::seconds kExitAfterLeave{3};
 
 std::string MakeToken() {
   std::random_device random;
   return absl::StrFormat("%08x%08x%08x%08x", random(), random(), random(), random());
 }
+
+double Seconds(Clock::duration d) { return std::chrono::duration<double>(d).count(); }
 
 absl::Status ExitError(const ServerExit& exit, const RunStatus& status) {
   std::string message = absl::StrCat("the server of region ", exit.region, " ended: ", exit.how);
@@ -39,20 +40,13 @@ absl::Status ExitError(const ServerExit& exit, const RunStatus& status) {
   return absl::AbortedError(message);
 }
 
-// A server that failed says more than one that left because the run was over for it.
-absl::Status FirstError(const std::vector<ServerExit>& exits, const RunStatus& status, bool clean_is_error) {
-  for (const ServerExit& exit : exits) {
-    if (!exit.clean) return ExitError(exit, status);
-  }
-  return clean_is_error && !exits.empty() ? ExitError(exits.front(), status) : absl::OkStatus();
-}
-
 class Runner {
  public:
-  Runner(const RunOptions& options, Allocator& allocator) : options_(options), allocator_(allocator) {}
+  Runner(const RunOptions& options, Allocator& allocator, const EventObserver& on_event)
+      : options_(options), allocator_(allocator), on_event_(on_event) {}
 
   absl::Status Run(const RunObserver& observe, RunResult* result) {
-    absl::Status s = StartAll();
+    absl::Status s = Serve();
     if (s.ok()) s = Watch(observe);
     const absl::Status end = StopAll(s.ok() ? "the run is over" : std::string(s.message()));
     if (s.ok()) s = end;
@@ -67,12 +61,21 @@ class Runner {
         result->windows.push_back(service_->Windows(static_cast<RegionId>(i)));
       }
     }
-    if (running_) result->wall_seconds = std::chrono::duration<double>(ended_ - running_since_).count();
+    if (running_) result->wall_seconds = Seconds(ended_ - running_since_);
     return s;
   }
 
  private:
-  absl::Status StartAll() {
+  // The newest server of a region.
+  struct Server {
+    uint64_t incarnation = 0;
+    bool alive = false;
+    Clock::time_point started, ended;
+    int failures = 0;  // in a row
+    ServerExit exit;   // when it is not alive
+  };
+
+  absl::Status Serve() {
     RunPlan plan;
     plan.world = options_.world;
     const int regions = options_.undivided ? 1 : options_.regions;
@@ -81,7 +84,10 @@ class Runner {
     plan.no_real_time = options_.no_real_time;
     plan.last_tick = options_.last_tick;
     plan.hash_every = options_.hash_every;
+    plan.checkpoint_every = options_.checkpoint_every;
     service_ = std::make_unique<ControlService>(plan);
+    tokens_ = plan.tokens;
+    servers_.resize(static_cast<size_t>(regions));
 
     grpc::EnableDefaultHealthCheckService(true);
     grpc::reflection::InitProtoReflectionServerBuilderPlugin();
@@ -94,11 +100,7 @@ class Runner {
     if (server_ == nullptr || port == 0) {
       return absl::UnavailableError(absl::StrCat("cannot listen on ", options_.listen, "; is the port in use?"));
     }
-    const std::string host = options_.listen.substr(0, options_.listen.rfind(':'));
-    for (int i = 0; i < regions; ++i) {
-      const absl::Status s = allocator_.Start({i, plan.tokens[i], absl::StrCat(host, ":", port)});
-      if (!s.ok()) return s;
-    }
+    address_ = absl::StrCat(options_.listen.substr(0, options_.listen.rfind(':')), ":", port);
     return absl::OkStatus();
   }
 
@@ -106,10 +108,9 @@ class Runner {
     const auto started = Clock::now();
     auto next_observe = started;
     for (;;) {
-      const std::vector<ServerExit> exits = allocator_.Poll();
+      TakeExits();
       const RunStatus status = service_->Status();
-      if (absl::Status s = FirstError(exits, status, true); !s.ok()) return s;
-      if (absl::Status s = CheckLeft(status); !s.ok()) return s;
+      if (absl::Status s = Act(status); !s.ok()) return s;
       const auto now = Clock::now();
       if (status.stage >= Stage::kRunning && !running_) {
         running_ = true;
@@ -129,20 +130,78 @@ class Runner {
     }
   }
 
-  absl::Status CheckLeft(const RunStatus& status) {
-    for (size_t i = 0; i < status.regions.size(); ++i) {
+  void TakeExits() {
+    for (ServerExit& exit : allocator_.Poll()) {
+      Server& server = servers_[static_cast<size_t>(exit.region)];
+      if (exit.incarnation != server.incarnation) continue;
+      server.alive = false;
+      server.ended = Clock::now();
+      server.failures = Seconds(server.ended - server.started) < kStableSeconds ? server.failures + 1 : 0;
+      server.exit = std::move(exit);
+    }
+  }
+
+  Observed Observe(const RunStatus& status) const {
+    Observed out;
+    out.recovers = options_.checkpoint_every > 0;
+    out.over = status.stage == Stage::kFinished;
+    const auto now = Clock::now();
+    for (size_t i = 0; i < servers_.size(); ++i) {
+      const Server& server = servers_[i];
       const RegionStatus& r = status.regions[i];
-      if (!r.left) continue;
-      std::vector<ServerExit> exits;
-      for (const auto until = Clock::now() + kExitAfterLeave; Clock::now() < until && exits.empty();) {
-        exits = allocator_.Poll();
-        if (exits.empty()) service_->Wait(kPollEvery);
-      }
-      if (absl::Status s = FirstError(exits, status, r.goodbye.empty()); !s.ok()) return s;
+      // Who loads a world has nothing to say.
+      const bool talks = r.ready && status.stage == Stage::kRunning && !r.finished;
+      out.regions.push_back({server.incarnation, server.alive, r.joined, r.joined && !r.left, r.finished,
+                             server.exit.clean, talks || r.left ? Seconds(now - r.reported) : 0,
+                             Seconds(now - server.ended), server.failures, server.exit.how});
+    }
+    return out;
+  }
+
+  absl::Status Act(const RunStatus& status) {
+    const std::vector<Action> actions = Reconcile(Observe(status));
+    // A server that failed says more than one that left because the run was over for it.
+    const Action* worst = nullptr;
+    for (const Action& a : actions) {
+      if (a.kind != Action::Kind::kGiveUp) continue;
+      if (worst == nullptr || !servers_[static_cast<size_t>(a.region)].exit.clean) worst = &a;
+    }
+    if (worst != nullptr) {
+      const Server& server = servers_[static_cast<size_t>(worst->region)];
+      if (!server.alive) return ExitError(server.exit, status);
+      const std::string& goodbye = status.regions[static_cast<size_t>(worst->region)].goodbye;
       return absl::AbortedError(
-          absl::StrCat("the server of region ", i, " left: ", r.goodbye.empty() ? "its stream ended" : r.goodbye));
+          absl::StrCat("the server of region ", worst->region, " left: ", goodbye.empty() ? worst->why : goodbye));
+    }
+    for (const Action& a : actions) {
+      if (a.kind == Action::Kind::kEnd) {
+        Tell(a.region, absl::StrCat("incarnation ", a.incarnation, " is ended: ", a.why));
+        allocator_.End(a.region, a.incarnation);
+      } else if (absl::Status s = Start(a); !s.ok()) {
+        return s;
+      }
     }
     return absl::OkStatus();
+  }
+
+  absl::Status Start(const Action& a) {
+    std::string token = tokens_[static_cast<size_t>(a.region)];
+    if (a.incarnation > 1) {
+      token = MakeToken();
+      service_->Expect(a.region, a.incarnation, token);
+      Tell(a.region, absl::StrCat("incarnation ", a.incarnation, " is started: ", a.why));
+    }
+    if (absl::Status s = allocator_.Start({a.region, a.incarnation, token, address_}); !s.ok()) return s;
+    Server& server = servers_[static_cast<size_t>(a.region)];
+    server.incarnation = a.incarnation;
+    server.alive = true;
+    server.started = Clock::now();
+    server.exit = {};
+    return absl::OkStatus();
+  }
+
+  void Tell(RegionId region, const std::string& what) const {
+    if (on_event_) on_event_({std::chrono::system_clock::now(), region, what});
   }
 
   absl::Status StopAll(const std::string& reason) {
@@ -150,7 +209,9 @@ class Runner {
     absl::Status result;
     const auto until = Clock::now() + options_.stop_timeout;
     while (allocator_.running() > 0 && Clock::now() < until && Interrupts() < 2) {
-      if (absl::Status s = FirstError(allocator_.Poll(), service_->Status(), false); !s.ok() && result.ok()) result = s;
+      for (const ServerExit& exit : allocator_.Poll()) {
+        if (!exit.clean && result.ok()) result = ExitError(exit, service_->Status());
+      }
       if (allocator_.running() > 0) service_->Wait(kPollEvery);
     }
     if (allocator_.running() > 0 && result.ok()) {
@@ -162,16 +223,21 @@ class Runner {
 
   const RunOptions& options_;
   Allocator& allocator_;
+  const EventObserver& on_event_;
   std::unique_ptr<ControlService> service_;
   std::unique_ptr<grpc::Server> server_;  // ends before the service
+  std::string address_;
+  std::vector<std::string> tokens_;  // of the first servers
+  std::vector<Server> servers_;      // by region
   bool running_ = false;
   Clock::time_point running_since_, ended_;
 };
 
 }  // namespace
 
-absl::Status RunWorld(const RunOptions& options, Allocator& allocator, const RunObserver& observe, RunResult* result) {
-  return Runner(options, allocator).Run(observe, result);
+absl::Status RunWorld(const RunOptions& options, Allocator& allocator, const RunObserver& observe, RunResult* result,
+                      const EventObserver& on_event) {
+  return Runner(options, allocator, on_event).Run(observe, result);
 }
 
 }  // namespace aureole

@@ -22,6 +22,9 @@ struct RunOptions {
   bool no_real_time = false;
   Tick last_tick = 0;   // 0: until interrupted
   Tick hash_every = 0;  // ticks; 0: never
+  // Ticks between checkpoints. With them, a server that dies or falls silent is replaced, and the run goes on bit for
+  // bit; 0: the run ends with the first server that does.
+  Tick checkpoint_every = 0;
   std::string listen = "127.0.0.1:0";
   std::chrono::seconds join_timeout{120};  // from the start of the servers to the last Ready
   std::chrono::seconds stop_timeout{10};   // from Stop to the end of the last server, which is then killed
@@ -35,14 +38,18 @@ struct RunResult {
   double wall_seconds = 0;                       // from Start to the end
 };
 
+// Told of what happens to servers, as it happens; on the caller's thread.
+using EventObserver = std::function<void(const RunEvent&)>;
+
 // Called about ten times a second, on the caller's thread; false interrupts the run.
 using RunObserver = std::function<bool(const RunStatus&)>;
 
 // Runs until every region has finished, the observer says so, or something fails; in every case no server is left when
 // it returns; a second interrupt (interrupts.h) makes short work of servers that take their time. `result` holds what
-// was reported until then. Cancelled: the observer ended it. Aborted: a server ended or left before its time; the
-// message names the region, how it ended and the tail of its log. DeadlineExceeded: the servers did not join, or did
-// not end, in time. Unavailable: the control plane's port cannot be opened.
-absl::Status RunWorld(const RunOptions& options, Allocator& allocator, const RunObserver& observe, RunResult* result);
+// was reported until then. Cancelled: the observer ended it. Aborted: a server ended or left before its time and could
+// not be replaced; the message names the region, how it ended and the tail of its log. DeadlineExceeded: the servers
+// did not join, or did not end, in time. Unavailable: the control plane's port cannot be opened.
+absl::Status RunWorld(const RunOptions& options, Allocator& allocator, const RunObserver& observe, RunResult* result,
+                      const EventObserver& on_event = nullptr);
 
 }  // namespace aureole

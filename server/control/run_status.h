@@ -20,6 +20,7 @@ enum class Stage : uint8_t {
 };
 
 struct RegionStatus {
+  uint64_t incarnation = 1;  // of the server that is expected, or here
   bool joined = false, ready = false, finished = false;
   bool left = false;    // its stream has ended
   std::string goodbye;  // the reason it gave, if any
@@ -38,6 +39,13 @@ struct TickSum {
   uint64_t hash = 0;
   int64_t bodies = 0;
   int regions = 0;  // that have reported this tick; complete when all have
+};
+
+// Something that the control plane has decided, or has seen happen.
+struct RunEvent {
+  std::chrono::system_clock::time_point time;
+  RegionId region = kNoRegion;  // kNoRegion: the world
+  std::string what;
 };
 
 struct RunStatus {

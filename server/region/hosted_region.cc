@@ -27,7 +27,8 @@ LinkIdentity IdentityOf(const v1::Assignment& assignment, const World& world) {
 
 }  // namespace
 
-absl::StatusOr<std::unique_ptr<HostedRegion>> HostedRegion::Load(const v1::Assignment& assignment) {
+absl::StatusOr<std::unique_ptr<HostedRegion>> HostedRegion::Load(const v1::Assignment& assignment,
+                                                                 const std::filesystem::path& data) {
   absl::StatusOr<World> world = WorldFromSpec(assignment.world());
   if (!world.ok()) return world.status();
   if (assignment.undivided()) {
@@ -48,16 +49,61 @@ absl::StatusOr<std::unique_ptr<HostedRegion>> HostedRegion::Load(const v1::Assig
   if (assignment.incarnation() == 0) {
     return absl::InvalidArgumentError("assignment.incarnation: must be at least 1");
   }
-  return std::unique_ptr<HostedRegion>(new HostedRegion(assignment, *std::move(world)));
+  if (assignment.checkpoint_every() < 0) {
+    return absl::InvalidArgumentError("assignment.checkpoint_every: must not be negative");
+  }
+  if (assignment.incarnations_size() != 0 && assignment.incarnations_size() != regions) {
+    return absl::InvalidArgumentError("assignment.incarnations: must be empty, or have one for each region");
+  }
+  if (assignment.checkpoint_every() > 0 && data.empty()) {
+    return absl::InvalidArgumentError(
+        "assignment.checkpoint_every: this server has no directory for checkpoints; start it with --data");
+  }
+  if (assignment.recover() && assignment.checkpoint_every() == 0) {
+    return absl::InvalidArgumentError("assignment.recover: needs checkpoints; set assignment.checkpoint_every");
+  }
+  std::unique_ptr<HostedRegion> out(new HostedRegion(assignment, *std::move(world)));
+  if (absl::Status s = out->LoadRegion(data); !s.ok()) return s;
+  return out;
 }
 
 HostedRegion::HostedRegion(const v1::Assignment& assignment, World world)
-    : assignment_(assignment),
-      world_(std::move(world)),
-      region_(std::make_unique<Region>(world_, assignment.region(), MakeBulletEngine(world_.environment))),
-      links_(std::make_unique<RegionLinks>(
-          IdentityOf(assignment_, world_), region_->peers(),
-          [](RegionId peer, const std::string& what) { spdlog::info("link to region {}: {}", peer, what); })) {}
+    : assignment_(assignment), world_(std::move(world)) {}
+
+absl::Status HostedRegion::LoadRegion(const std::filesystem::path& data) {
+  const bool keep = assignment_.checkpoint_every() > 0;
+  if (keep) {
+    absl::StatusOr<std::unique_ptr<Journal>> journal = Journal::Open(data);
+    if (!journal.ok()) return journal.status();
+    journal_ = *std::move(journal);
+  }
+  std::map<RegionId, LinkState> states;
+  if (assignment_.recover()) {
+    absl::StatusOr<Journal::Recovered> found = journal_->Recover(WorldHash(assignment_.world()), assignment_.region());
+    if (!found.ok()) return found.status();
+    absl::StatusOr<std::unique_ptr<Region>> region =
+        Region::Load(world_, assignment_.region(), MakeBulletEngine(world_.environment), found->checkpoint.state);
+    if (!region.ok()) return region.status();
+    region_ = *std::move(region);
+    states = std::move(found->checkpoint.links);
+    replay_ = std::move(found->inputs);
+    hashes_ = std::move(found->checkpoint.hashes);
+  } else {
+    region_ = std::make_unique<Region>(world_, assignment_.region(), MakeBulletEngine(world_.environment));
+  }
+  const auto log = [](RegionId peer, const std::string& what) { spdlog::info("link to region {}: {}", peer, what); };
+  links_ =
+      std::make_unique<RegionLinks>(IdentityOf(assignment_, world_), region_->peers(), log, keep, std::move(states));
+  for (RegionId peer : region_->peers()) {
+    if (peer < assignment_.incarnations_size()) links_->Redirect(peer, "", assignment_.incarnations(peer));
+  }
+  if (!keep || assignment_.recover()) return absl::OkStatus();
+  return journal_->Begin(TakeCheckpoint(WorldHash(assignment_.world()), *region_, *links_));
+}
+
+void HostedRegion::PeerMoved(const v1::PeerMoved& moved) {
+  links_->Redirect(moved.region(), moved.endpoint(), moved.incarnation());
+}
 
 HostedRegion::~HostedRegion() { Stop(); }
 
@@ -71,7 +117,13 @@ void HostedRegion::Start(int64_t start_unix_us, TickLoop::Hooks hooks) {
   options.start_unix_us = start_unix_us;
   options.last_tick = assignment_.last_tick();
   options.hash_every = assignment_.hash_every();
-  loop_ = std::make_unique<TickLoop>(world_, region_.get(), links_.get(), options, std::move(hooks));
+  options.checkpoint_every = assignment_.checkpoint_every();
+  options.world_hash = WorldHash(assignment_.world());
+  options.recovered = assignment_.recover();
+  options.replay = std::move(replay_);
+  options.hashes = std::move(hashes_);
+  loop_ = std::make_unique<TickLoop>(world_, region_.get(), links_.get(), journal_.get(), std::move(options),
+                                     std::move(hooks));
   thread_ = std::thread([this] { loop_->Run(); });
 }
 

@@ -1,6 +1,7 @@
 // One assignment being served: the world, the region, its links and its tick thread.
 #pragma once
 
+#include <filesystem>
 #include <memory>
 #include <string>
 #include <thread>
@@ -10,6 +11,7 @@
 #include "aureole/v1/control.pb.h"
 #include "server/core/region.h"
 #include "server/core/world.h"
+#include "server/region/journal.h"
 #include "server/region/region_links.h"
 #include "server/region/tick_loop.h"
 
@@ -17,8 +19,11 @@ namespace aureole {
 
 class HostedRegion {
  public:
-  // Loads the world and the region's share of it. InvalidArgument when the assignment makes no sense.
-  static absl::StatusOr<std::unique_ptr<HostedRegion>> Load(const v1::Assignment& assignment);
+  // Loads the world and the region's share of it, or, when the assignment says `recover`, what the journal has of it.
+  // `data`: directory for the journal; needed when the assignment asks for checkpoints. InvalidArgument when the
+  // assignment makes no sense, else the journal's errors.
+  static absl::StatusOr<std::unique_ptr<HostedRegion>> Load(const v1::Assignment& assignment,
+                                                            const std::filesystem::path& data);
   // Stops and joins the tick thread, and closes the links.
   ~HostedRegion();
 
@@ -31,14 +36,20 @@ class HostedRegion {
   void Connect(PeerService* service);
   // Starts the tick thread. Once.
   void Start(int64_t start_unix_us, TickLoop::Hooks hooks);
+  // The peer's next incarnation is there.
+  void PeerMoved(const v1::PeerMoved& moved);
   // Ends the tick thread. Idempotent.
   void Stop();
 
  private:
   HostedRegion(const v1::Assignment& assignment, World world);
+  absl::Status LoadRegion(const std::filesystem::path& data);
 
   const v1::Assignment assignment_;
   const World world_;
+  std::unique_ptr<Journal> journal_;  // null: no checkpoints
+  std::vector<LoggedInput> replay_;
+  std::vector<Checkpoint::Hash> hashes_;
   std::unique_ptr<Region> region_;
   std::unique_ptr<RegionLinks> links_;
   std::unique_ptr<TickLoop> loop_;

@@ -26,6 +26,7 @@ int main(int argc, char** argv) {
   app.add_option("--token", options.token, "says which region this process was started for");
   app.add_option("--listen", options.listen, "host:port for peers and clients; port 0 is any")->capture_default_str();
   app.add_option("--metrics", options.metrics, "host:port of Prometheus /metrics, or off")->capture_default_str();
+  app.add_option("--data", options.data, "directory for checkpoints, of this region alone; made when missing");
   app.add_option("--log-level", log_level, "on standard error")
       ->check(CLI::IsMember({"debug", "info", "warn", "error", "off"}))
       ->capture_default_str();

@@ -7,7 +7,8 @@
 namespace aureole {
 
 RegionLinks::RegionLinks(const LinkIdentity& identity, const std::vector<RegionId>& peers,
-                         std::function<void(RegionId, const std::string&)> log)
+                         std::function<void(RegionId, const std::string&)> log, bool keep,
+                         std::map<RegionId, LinkState> states)
     : identity_(identity) {
   const auto deliver = [this](Frame frame) {
     bool enough = false;
@@ -19,7 +20,8 @@ RegionLinks::RegionLinks(const LinkIdentity& identity, const std::vector<RegionI
     if (enough) arrived_.notify_one();
   };
   for (RegionId peer : peers)
-    links_.push_back(std::make_unique<PeerLink>(PeerLink::Options{identity, peer, deliver, log}));
+    links_.push_back(
+        std::make_unique<PeerLink>(PeerLink::Options{identity, peer, deliver, log, keep, std::move(states[peer])}));
 }
 
 RegionLinks::~RegionLinks() { Close(); }
@@ -34,6 +36,26 @@ void RegionLinks::Connect(PeerService* service, const std::vector<std::string>& 
   for (const auto& link : links_) {
     if (link->peer() > identity_.self) link->Dial(endpoints.at(link->peer()));
   }
+}
+
+void RegionLinks::Redirect(RegionId peer, const std::string& endpoint, uint64_t incarnation) {
+  for (const auto& link : links_) {
+    if (link->peer() == peer) link->Redirect(endpoint, incarnation);
+  }
+}
+
+void RegionLinks::SetDurable(const std::map<RegionId, uint64_t>& frames) {
+  for (const auto& link : links_) link->SetDurable(frames.at(link->peer()));
+}
+
+std::map<RegionId, LinkState> RegionLinks::States() const {
+  std::map<RegionId, LinkState> out;
+  for (const auto& link : links_) out[link->peer()] = link->State();
+  return out;
+}
+
+bool RegionLinks::caught_up() const {
+  return std::all_of(links_.begin(), links_.end(), [](const auto& link) { return link->caught_up(); });
 }
 
 void RegionLinks::Send(const std::vector<Frame>& frames) {

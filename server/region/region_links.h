@@ -4,6 +4,7 @@
 #include <chrono>
 #include <condition_variable>
 #include <functional>
+#include <map>
 #include <memory>
 #include <mutex>
 #include <string>
@@ -19,9 +20,11 @@ class RegionLinks {
  public:
   using Clock = std::chrono::steady_clock;
 
-  // `log` comes from gRPC threads.
+  // `log` comes from gRPC threads. `keep`: this region makes checkpoints. `states`: where an earlier incarnation of it
+  // left off, by peer.
   RegionLinks(const LinkIdentity& identity, const std::vector<RegionId>& peers,
-              std::function<void(RegionId peer, const std::string& what)> log);
+              std::function<void(RegionId peer, const std::string& what)> log, bool keep = false,
+              std::map<RegionId, LinkState> states = {});
   // Closes.
   ~RegionLinks();
   RegionLinks(const RegionLinks&) = delete;
@@ -30,6 +33,13 @@ class RegionLinks {
   // Accepts the lower peers through `service`, which outlives the links, and dials the higher ones at
   // endpoints[region]. Once.
   void Connect(PeerService* service, const std::vector<std::string>& endpoints);
+
+  // See PeerLink.
+  void Redirect(RegionId peer, const std::string& endpoint, uint64_t incarnation);
+  void SetDurable(const std::map<RegionId, uint64_t>& frames);
+  std::map<RegionId, LinkState> States() const;
+  // Of all links.
+  bool caught_up() const;
 
   // Queues the frames; never waits for the network.
   void Send(const std::vector<Frame>& frames);

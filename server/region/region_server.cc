@@ -102,6 +102,7 @@ struct Process {
   PeerService peers;
   SimulationService simulation;
   RecordingService recording;
+  std::string data;
   std::unique_ptr<GrpcServer> server;
   std::unique_ptr<ControlStream> control;
   std::unique_ptr<HostedRegion> hosted;
@@ -141,7 +142,7 @@ absl::Status Process::Handle(const v1::ToRegion& message) {
   if (message.has_assignment()) {
     if (hosted != nullptr) return absl::FailedPreconditionError("a second assignment");
     const v1::Assignment& assignment = message.assignment();
-    absl::StatusOr<std::unique_ptr<HostedRegion>> loaded = HostedRegion::Load(assignment);
+    absl::StatusOr<std::unique_ptr<HostedRegion>> loaded = HostedRegion::Load(assignment, data);
     if (!loaded.ok()) return loaded.status();
     hosted = *std::move(loaded);
     spdlog::info("region {} of {}, world {}, {} bodies, k = {}, tick {} us, layout epoch {}, last tick {}, {}",
@@ -153,6 +154,7 @@ absl::Status Process::Handle(const v1::ToRegion& message) {
     hosted->Connect(&peers);
     v1::FromRegion ready;
     ready.mutable_ready()->set_bodies(hosted->region().engine().Counts().bodies);
+    ready.mutable_ready()->set_tick(hosted->region().tick());
     control->Send(std::move(ready));
   } else if (message.has_start()) {
     if (hosted == nullptr) return absl::FailedPreconditionError("a start without an assignment");
@@ -160,6 +162,11 @@ absl::Status Process::Handle(const v1::ToRegion& message) {
     recording.Serve(hosted->assignment().region(), hosted->assignment().world(), hosted->world().exchange.k == 0);
     hosted->Start(message.start().start_unix_us(), Hooks());
     server->SetServing(true);
+  } else if (message.has_peer_moved()) {
+    if (hosted == nullptr) return absl::FailedPreconditionError("a peer has moved before the assignment");
+    spdlog::info("region {} is incarnation {} now, at {}", message.peer_moved().region(),
+                 message.peer_moved().incarnation(), message.peer_moved().endpoint());
+    hosted->PeerMoved(message.peer_moved());
   }
   return absl::OkStatus();
 }
@@ -203,6 +210,7 @@ void BlockSignals() {
 
 int RunRegionServer(const RegionServerOptions& options) {
   Process process;
+  process.data = options.data;
   const SignalThread signals(&process.events);
   if (options.metrics != "off") {
     absl::StatusOr<std::unique_ptr<RegionMetrics>> metrics = RegionMetrics::Serve(options.metrics);

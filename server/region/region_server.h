@@ -10,6 +10,7 @@ struct RegionServerOptions {
   std::string token;                    // says which region this process was started for
   std::string listen = "127.0.0.1:0";   // for peers and clients
   std::string metrics = "127.0.0.1:0";  // Prometheus over HTTP; "off"
+  std::string data;                     // directory for checkpoints; empty: none
 };
 
 // Blocks SIGTERM, SIGINT and SIGUSR1 in the calling thread and all that it starts: RunRegionServer takes them. Call it

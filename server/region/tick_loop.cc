@@ -16,6 +16,10 @@ constexpr milliseconds kReportEvery(200);
 constexpr milliseconds kWaitIsWorthTelling(100);  // in reports
 constexpr milliseconds kWaitIsWorthLogging(1000);
 constexpr milliseconds kLongestSleep(100);  // so that Stop is heard
+// A world that is later than this, because a server was overloaded or dead, does not try to make it up: nobody wants to
+// watch the lost time run past.
+constexpr milliseconds kMostBehind(500);
+constexpr size_t kRecentHashes = 256;  // more than are made between two reports
 
 double Ms(std::chrono::steady_clock::duration d) { return std::chrono::duration<double, std::milli>(d).count(); }
 
@@ -28,13 +32,19 @@ void SleepUntil(std::chrono::steady_clock::time_point t) {
 
 }  // namespace
 
-TickLoop::TickLoop(const World& world, Region* region, RegionLinks* links, Options options, Hooks hooks)
+TickLoop::TickLoop(const World& world, Region* region, RegionLinks* links, Journal* journal, Options options,
+                   Hooks hooks)
     : world_(world),
       region_(region),
       links_(links),
-      options_(options),
+      journal_(journal),
+      options_(std::move(options)),
       hooks_(std::move(hooks)),
-      windows_(world.environment.tick_us) {}
+      windows_(world.environment.tick_us),
+      replaying_(options_.recovered),
+      checkpointed_(region->tick()) {
+  for (const aureole::Checkpoint::Hash& h : options_.hashes) AddHash(h);
+}
 
 void TickLoop::Stop() {
   stopped_ = true;
@@ -61,9 +71,15 @@ bool TickLoop::Run() {
 }
 
 bool TickLoop::SleepUntilDue(Tick n) {
-  if (!options_.real_time) return !stopped_;
-  const Clock::time_point due = start_ + microseconds(n * world_.environment.tick_us);
+  if (replaying_ && links_->caught_up()) EndReplay();
+  if (!options_.real_time || replaying_) return !stopped_;
   const Clock::time_point since = Clock::now();
+  Clock::time_point due = start_ + microseconds(n * world_.environment.tick_us);
+  if (since - due > kMostBehind) {
+    start_ += since - due;
+    lost_ += since - due;
+    due = since;
+  }
   while (!stopped_ && Clock::now() < due) SleepUntil(std::min<Clock::time_point>(due, Clock::now() + kLongestSleep));
   clock_.AddWait(Ms(Clock::now() - since));
   return !stopped_;
@@ -71,6 +87,7 @@ bool TickLoop::SleepUntilDue(Tick n) {
 
 bool TickLoop::RunTick() {
   const Tick n = region_->tick() + 1;
+  if (journal_ != nullptr) Checkpoint();
   OfferInputs();
   while (region_->tick() < n) {
     if (!AwaitPeers()) return false;
@@ -82,14 +99,63 @@ bool TickLoop::RunTick() {
   return true;
 }
 
+// Nothing that this incarnation says may differ from what an earlier one has said, so new inputs wait until that is
+// over. Without a journal inputs act at once; with one they are made durable during a tick and offered in the next.
 void TickLoop::OfferInputs() {
-  if (region_->inputs_waiting() > 0) return;
-  for (const Input& input : hooks_.inputs()) {
-    if (absl::Status s = region_->Submit(input); !s.ok()) {
-      hooks_.log(
-          absl::StrCat("input ", input.sequence, " of client ", input.source, " refused: ", std::string(s.message())));
-    }
+  const Tick n = region_->tick() + 1;
+  for (; replayed_ < options_.replay.size() && options_.replay[replayed_].tick <= n; ++replayed_) {
+    Submit(options_.replay[replayed_].input);
   }
+  if (!logged_.empty()) {
+    if (absl::Status s = journal_->AwaitLogged(); !s.ok()) {
+      hooks_.log(absl::StrCat("inputs of tick ", n, " are not durable: ", std::string(s.message())));
+    }
+    for (const Input& input : logged_) Submit(input);
+    logged_.clear();
+  }
+  if (replaying_ || region_->inputs_waiting() > 0) return;
+  std::vector<Input> inputs = hooks_.inputs();
+  if (journal_ == nullptr) {
+    for (const Input& input : inputs) Submit(input);
+  } else if (!inputs.empty()) {
+    journal_->Log(n + 1, inputs);
+    logged_ = std::move(inputs);
+  }
+}
+
+void TickLoop::Submit(const Input& input) {
+  if (absl::Status s = region_->Submit(input); !s.ok()) {
+    hooks_.log(
+        absl::StrCat("input ", input.sequence, " of client ", input.source, " refused: ", std::string(s.message())));
+  }
+}
+
+void TickLoop::Checkpoint() {
+  if (const std::optional<Journal::Used> used = journal_->TakeDurable()) links_->SetDurable(*used);
+  if (region_->tick() < checkpointed_ + options_.checkpoint_every || journal_->writing()) return;
+  const Clock::time_point since = Clock::now();
+  aureole::Checkpoint checkpoint = TakeCheckpoint(options_.world_hash, *region_, *links_);
+  checkpoint.hashes.assign(recent_hashes_.begin(), recent_hashes_.end());
+  journal_->Write(std::move(checkpoint));
+  checkpointed_ = region_->tick();
+  longest_pause_ = std::max(longest_pause_, Clock::now() - since);
+}
+
+// What was lost is made up; the wall clock goes on from here, whatever it showed before.
+void TickLoop::EndReplay() {
+  replaying_ = false;
+  start_ = Clock::now() - microseconds((region_->tick() + 1) * world_.environment.tick_us);
+  hooks_.log(absl::StrCat("caught up at tick ", region_->tick()));
+}
+
+void TickLoop::AddHash(const aureole::Checkpoint::Hash& h) {
+  v1::TickHash* hash = pending_.add_hashes();
+  hash->set_tick(h.tick);
+  hash->set_hash(h.hash);
+  hash->set_bodies(h.bodies);
+  if (journal_ == nullptr) return;
+  recent_hashes_.push_back(h);
+  while (recent_hashes_.size() > kRecentHashes) recent_hashes_.pop_front();
 }
 
 // Until the region can go on; false when stopped. Reports go out meanwhile, and say for whom it waits.
@@ -160,12 +226,9 @@ void TickLoop::AfterTick() {
   body_ticks_ += bodies;
   away_body_ticks_ += region_->stats().away_bodies;
   if ((options_.hash_every > 0 && n % options_.hash_every == 0) || n == options_.last_tick) {
-    v1::TickHash* hash = pending_.add_hashes();
-    hash->set_tick(n);
-    hash->set_hash(region_->StateHash());
     std::vector<BodyRecord> records;  // those in flight included
     region_->Observe(&records);
-    hash->set_bodies(static_cast<int64_t>(records.size()));
+    AddHash({n, region_->StateHash(), static_cast<int64_t>(records.size())});
   }
   if (const std::vector<InputOutcome> outcomes = region_->TakeOutcomes(); !outcomes.empty()) {
     hooks_.outcomes(outcomes);
@@ -222,6 +285,18 @@ void TickLoop::Report(const std::vector<RegionId>& waiting_for, bool finished) {
   r.set_wait_us(std::chrono::duration_cast<microseconds>(waited_).count());
   r.mutable_waiting_for()->Add(waiting_for.begin(), waiting_for.end());
   r.set_finished(finished);
+  r.set_replaying(replaying_);
+  r.set_lost_us(std::chrono::duration_cast<microseconds>(lost_).count());
+  if (journal_ != nullptr) {
+    const Journal::Stats journal = journal_->stats();
+    r.set_checkpoint_tick(journal.durable_tick);
+    r.set_checkpoints(journal.checkpoints);
+    r.set_checkpoint_bytes(journal.bytes);
+    r.set_checkpoint_write_ms(journal.write_ms);
+    r.set_checkpoint_pause_ms(Ms(longest_pause_));
+    r.set_storage_failures(journal.failures);
+    r.set_storage_failure(journal.last_failure);
+  }
   hooks_.report(r);
   pending_.Clear();
   frames_since_report_.clear();

@@ -4,13 +4,16 @@
 
 #include <atomic>
 #include <cstdint>
+#include <deque>
 #include <functional>
 #include <string>
 #include <vector>
 
 #include "aureole/v1/control.pb.h"
 #include "server/core/region.h"
+#include "server/region/checkpoint.h"
 #include "server/region/frame_clock.h"
+#include "server/region/journal.h"
 #include "server/region/region_links.h"
 
 namespace aureole {
@@ -24,6 +27,14 @@ class TickLoop {
     int64_t start_unix_us = 0;
     Tick last_tick = 0;      // 0: runs until Stop
     int64_t hash_every = 0;  // ticks; 0: only the last tick is hashed
+    // With a journal.
+    int64_t checkpoint_every = 0;  // ticks
+    uint64_t world_hash = 0;
+    // The region was loaded from a checkpoint: what it did after it is done again, as fast as it can, with these
+    // inputs.
+    bool recovered = false;
+    std::vector<LoggedInput> replay;
+    std::vector<Checkpoint::Hash> hashes;  // reported again
   };
   // All called on the tick thread.
   struct Hooks {
@@ -36,8 +47,8 @@ class TickLoop {
     std::function<void(const std::string&)> log;  // waits over 1 s, violations, refused frames
   };
 
-  // All outlive the loop.
-  TickLoop(const World& world, Region* region, RegionLinks* links, Options options, Hooks hooks);
+  // All outlive the loop. `journal`: null for none.
+  TickLoop(const World& world, Region* region, RegionLinks* links, Journal* journal, Options options, Hooks hooks);
 
   // Runs to the last tick or until Stop; then sends a last report. True when the last tick was reached.
   bool Run();
@@ -50,6 +61,10 @@ class TickLoop {
   bool SleepUntilDue(Tick n);
   bool RunTick();
   void OfferInputs();
+  void Submit(const Input& input);
+  void Checkpoint();
+  void EndReplay();
+  void AddHash(const aureole::Checkpoint::Hash& h);
   bool AwaitPeers();
   void Take(Clock::time_point deadline);
   void EndLap();
@@ -59,6 +74,7 @@ class TickLoop {
   const World& world_;
   Region* const region_;
   RegionLinks* const links_;
+  Journal* const journal_;
   const Options options_;
   const Hooks hooks_;
   std::atomic<bool> stopped_ = false;
@@ -69,8 +85,14 @@ class TickLoop {
   std::vector<RegionId> missing_;
   v1::Report pending_;  // hashes, windows and violations since the last report
   std::vector<double> frames_since_report_;
-  Clock::time_point start_;  // of tick 0
-  Tick lap_of_ = 0;          // the tick whose lap runs; 0: none
+  Clock::time_point start_;    // of tick 0
+  Tick lap_of_ = 0;            // the tick whose lap runs; 0: none
+  bool replaying_ = false;     // repeats what an earlier incarnation did
+  size_t replayed_ = 0;        // of options_.replay
+  std::vector<Input> logged_;  // being made durable, for the next tick
+  Tick checkpointed_ = 0;
+  std::deque<aureole::Checkpoint::Hash> recent_hashes_;  // that may not have reached the control plane
+  Clock::duration longest_pause_{}, lost_{};
   Clock::time_point reported_at_;
   Tick reported_tick_ = 0;
   int64_t waits_ = 0;

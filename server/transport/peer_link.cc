@@ -90,13 +90,25 @@ absl::Status CheckHello(const LinkIdentity& identity, const v1::LinkHello& hello
   return absl::OkStatus();
 }
 
-PeerLink::PeerLink(Options options) : options_(std::move(options)), backoff_ms_(kMinBackoffMs) {}
+PeerLink::PeerLink(Options options)
+    : options_(std::move(options)),
+      sender_(options_.state.first, options_.state.kept),
+      receiver_(options_.state.applied),
+      durable_(options_.state.applied),
+      backoff_ms_(kMinBackoffMs) {}
 
 PeerLink::~PeerLink() { Close(); }
 
 void PeerLink::Dial(const std::string& endpoint) {
   AUREOLE_CHECK(options_.identity.self < options_.peer && channel_ == nullptr, "region %d dials region %d",
                 options_.identity.self, options_.peer);
+  const std::lock_guard lock(mutex_);
+  OpenChannel(endpoint);
+  Connect();
+}
+
+// Holds the mutex.
+void PeerLink::OpenChannel(const std::string& endpoint) {
   grpc::ChannelArguments arguments;
   arguments.SetInt(GRPC_ARG_ENABLE_HTTP_PROXY, 0);
   arguments.SetInt(GRPC_ARG_INITIAL_RECONNECT_BACKOFF_MS, kMinBackoffMs);
@@ -107,16 +119,42 @@ void PeerLink::Dial(const std::string& endpoint) {
   arguments.SetMaxReceiveMessageSize(kMaxMessageBytes);
   channel_ = grpc::CreateCustomChannel(endpoint, grpc::InsecureChannelCredentials(), arguments);
   stub_ = v1::Peer::NewStub(channel_);
+}
+
+void PeerLink::Redirect(const std::string& endpoint, uint64_t incarnation) {
   const std::lock_guard lock(mutex_);
-  Connect();
+  if (closed_ || incarnation <= peer_incarnation_) return;
+  peer_incarnation_ = incarnation;
+  peer_met_ = false;
+  if (channel_ != nullptr) {
+    old_channels_.push_back(channel_);
+    OpenChannel(endpoint);
+  }
+  if (current_ != nullptr) current_->Cancel();
 }
 
 void PeerLink::Send(EncodedFrame frame) {
   const std::lock_guard lock(mutex_);
   const uint64_t sequence = sender_.Push(frame);
-  if (current_ == nullptr || !current_->open) return;
+  if (current_ == nullptr || !current_->open || sequence <= peer_applied_) return;
   current_->queue.emplace_back(sequence, std::move(frame));
   Pump(current_);
+}
+
+void PeerLink::SetDurable(uint64_t frames) {
+  const std::lock_guard lock(mutex_);
+  durable_ = std::max(durable_, frames);
+  if (current_ != nullptr) Pump(current_);
+}
+
+LinkState PeerLink::State() const {
+  const std::lock_guard lock(mutex_);
+  return {0, sender_.first(), sender_.messages()};
+}
+
+bool PeerLink::caught_up() const {
+  const std::lock_guard lock(mutex_);
+  return peer_met_ && peer_applied_ < sender_.next();
 }
 
 void PeerLink::Cut() {
@@ -157,6 +195,8 @@ v1::LinkHello PeerLink::Hello() const {
   hello.set_exchange_delay(static_cast<uint32_t>(options_.identity.exchange_delay));
   hello.set_tick_us(options_.identity.tick_us);
   hello.set_applied(receiver_.applied());
+  hello.set_keep(options_.keep);
+  hello.set_durable(durable_);
   return hello;
 }
 
@@ -167,18 +207,28 @@ absl::Status PeerLink::Accept(LinkStream* stream, const v1::LinkHello& hello) {
     return absl::FailedPreconditionError(absl::StrCat("link refused by region ", options_.identity.self, ": region ",
                                                       hello.from(), " answers for region ", options_.peer));
   }
-  if (hello.incarnation() == 0 || (peer_incarnation_ != 0 && hello.incarnation() != peer_incarnation_)) {
+  if (hello.incarnation() == 0 || hello.incarnation() < peer_incarnation_) {
     return absl::FailedPreconditionError(
         absl::StrCat("link refused by region ", options_.identity.self, ": region ", hello.from(), " is incarnation ",
-                     hello.incarnation(), ", was ", peer_incarnation_, "; a restarted region cannot go on from here"));
+                     hello.incarnation(), ", and incarnation ", peer_incarnation_, " is known: it has been replaced"));
   }
-  if (!sender_.CanResume(hello.applied())) {
+  if (hello.incarnation() > peer_incarnation_ && peer_incarnation_ != 0 && !hello.keep()) {
+    return absl::FailedPreconditionError(absl::StrCat(
+        "link refused by region ", options_.identity.self, ": region ", hello.from(), " is incarnation ",
+        hello.incarnation(), ", was ", peer_incarnation_, "; without checkpoints it cannot go on from here"));
+  }
+  // Who was loaded from a checkpoint will make again what the peer already has.
+  const bool ahead = options_.identity.incarnation > 1 && hello.applied() >= sender_.next();
+  if (!ahead && !sender_.CanResume(hello.applied())) {
     return absl::FailedPreconditionError(absl::StrCat("link refused by region ", options_.identity.self, ": region ",
                                                       hello.from(), " has applied frame ", hello.applied(),
                                                       "; kept are the ", sender_.kept(), " before ", sender_.next()));
   }
   peer_incarnation_ = hello.incarnation();
-  sender_.Acknowledge(hello.applied());
+  peer_met_ = true;
+  peer_keeps_ = hello.keep();
+  peer_applied_ = hello.applied();
+  sender_.Acknowledge(peer_keeps_ ? hello.durable() : hello.applied());
   sender_.Resume(hello.applied(),
                  [&](uint64_t sequence, const EncodedFrame& frame) { stream->queue.emplace_back(sequence, frame); });
   stream->open = true;
@@ -203,6 +253,7 @@ absl::Status PeerLink::Attach(LinkStream* stream, const v1::LinkHello& hello) {
   current_ = stream;
   ++streams_;
   told_ = receiver_.applied();
+  told_durable_ = durable_;
   *stream->out.mutable_hello() = Hello();
   stream->writing = true;
   stream->StartWriting(&stream->out);
@@ -278,8 +329,8 @@ absl::StatusOr<bool> PeerLink::Assemble(LinkStream* stream, v1::PeerMessage* mes
 
 // Holds the mutex. `frame` is null when the message carries none, or only a part.
 absl::Status PeerLink::Apply(LinkStream* stream, const v1::PeerMessage& message, Frame* frame) {
-  const uint64_t durable = message.durable() != 0 ? message.durable() : message.applied();
-  if (std::max(durable, message.applied()) >= sender_.next()) {
+  const uint64_t durable = message.durable() != 0 || peer_keeps_ ? message.durable() : message.applied();
+  if (std::max(durable, message.applied()) >= std::max(sender_.next(), peer_applied_ + 1)) {
     return absl::InvalidArgumentError(absl::StrCat("acknowledges frame ", durable, ", which was never sent"));
   }
   sender_.Acknowledge(durable);
@@ -350,11 +401,14 @@ void PeerLink::LogOnce(const std::string& why) {
 // Holds the mutex. Starts the next write, if there is one and none is in flight.
 void PeerLink::Pump(LinkStream* stream) {
   if (stream->ended || !stream->open || stream->writing) return;
-  const bool acknowledge = receiver_.applied() - told_ >= kAcknowledgeEvery;
+  const bool acknowledge = options_.keep ? durable_ > told_durable_ : receiver_.applied() - told_ >= kAcknowledgeEvery;
   if (stream->queue.empty() && !acknowledge) return;
   v1::PeerMessage& out = stream->out;
   out.Clear();
-  if (acknowledge) out.set_applied(told_ = receiver_.applied());
+  if (acknowledge) {
+    out.set_applied(told_ = receiver_.applied());
+    if (options_.keep) out.set_durable(told_durable_ = durable_);
+  }
   if (!stream->queue.empty()) PutFrame(stream);
   stats_.bytes_sent += static_cast<int64_t>(out.ByteSizeLong());
   stream->writing = true;
@@ -385,6 +439,7 @@ void PeerLink::Connect() {
   current_ = stream;
   ++streams_;
   told_ = receiver_.applied();
+  told_durable_ = durable_;
   *stream->out.mutable_hello() = Hello();
   stream->writing = true;
   stream->Start(stub_.get());

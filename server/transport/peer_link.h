@@ -1,9 +1,11 @@
 // One link: the frames between this region and one peer, exactly once and in order, over any number of connections.
 //
-// Frames to send are kept until the peer has acknowledged them; a new connection goes on after the last one that the
-// peer applied (server/core/link.h, P54). One write is in flight at a time. The side with the lower region id dials,
-// and dials again when the connection ends, 50 ms to 1 s later (P57). Nothing here waits: the tick thread only ever
-// queues a frame, and received frames are handed to `deliver`.
+// Frames to send are kept until the peer has acknowledged them, or, when it makes checkpoints, until they are durable
+// there; a new connection goes on after the last one that the peer applied (server/core/link.h, P54). A peer that died
+// and was loaded from its checkpoint comes with a higher incarnation, and gets again what it has lost. One write is in
+// flight at a time. The side with the lower region id dials, and dials again when the connection ends, 50 ms to 1 s
+// later (P57). Nothing here waits: the tick thread only ever queues a frame, and received frames are handed to
+// `deliver`.
 #pragma once
 
 #include <chrono>
@@ -15,6 +17,7 @@
 #include <mutex>
 #include <string>
 #include <utility>
+#include <vector>
 
 #include <absl/status/status.h>
 #include <absl/status/statusor.h>
@@ -44,6 +47,13 @@ absl::Status CheckHello(const LinkIdentity& identity, const v1::LinkHello& hello
 
 // A serialised frame; shared, since a broadcast goes to every link.
 using EncodedFrame = std::shared_ptr<const std::string>;
+
+// What of a link goes into a checkpoint.
+struct LinkState {
+  uint64_t applied = 0;           // frames of the peer
+  uint64_t first = 1;             // number of kept.front()
+  std::deque<EncodedFrame> kept;  // frames that the peer may yet need
+};
 
 // Totals since the start.
 struct LinkStats {
@@ -91,6 +101,10 @@ class PeerLink {
     std::function<void(Frame)> deliver;
     // Told of what an operator wants to know: connected, lost, refused. From a gRPC thread; must not call this link.
     std::function<void(RegionId peer, const std::string& what)> log;
+    // This region makes checkpoints: the peer keeps its frames until SetDurable says that it need not.
+    bool keep = false;
+    // Where an earlier incarnation of this region left off.
+    LinkState state;
   };
 
   explicit PeerLink(Options options);
@@ -103,8 +117,17 @@ class PeerLink {
 
   // Connects, and stays connected until Close. Once; only the side with the lower id.
   void Dial(const std::string& endpoint);
+  // From here on the peer is another incarnation, at this endpoint: older ones are refused, and when this side dials,
+  // it dials there. Ignored when a newer one is known.
+  void Redirect(const std::string& endpoint, uint64_t incarnation);
   // Any thread; never waits for the network.
   void Send(EncodedFrame frame);
+  // Frames of the peer are durable here up to this number.
+  void SetDurable(uint64_t frames);
+  // What is kept for the peer; `applied` is left 0: it is the reader of the frames that knows what it has used.
+  LinkState State() const;
+  // The peer was met, and has had no frame of an earlier incarnation of this region that this one has not sent again.
+  bool caught_up() const;
   // Ends the present connection, if any, as a fault of the network would; the link resumes. Any thread.
   void Cut();
   // Waits until every frame was written to a connection; false when that took longer.
@@ -139,18 +162,24 @@ class PeerLink {
   absl::Status Apply(LinkStream* stream, const v1::PeerMessage& message, Frame* frame);
   void Pump(LinkStream* stream);
   void PutFrame(LinkStream* stream);
+  void OpenChannel(const std::string& endpoint);
   void Connect();
   void Redial();
 
   const Options options_;
   std::shared_ptr<grpc::Channel> channel_;
+  std::vector<std::shared_ptr<grpc::Channel>> old_channels_;  // kept as long as their streams may be (see Released)
   std::unique_ptr<v1::Peer::Stub> stub_;
 
   mutable std::mutex mutex_;
   std::condition_variable changed_;
   LinkSender<EncodedFrame> sender_;
   LinkReceiver receiver_;
-  uint64_t told_ = 0;              // what the peer knows that we applied
+  uint64_t told_ = 0;  // what the peer knows that we applied
+  uint64_t durable_ = 0, told_durable_ = 0;
+  bool peer_met_ = false;          // this incarnation of it
+  bool peer_keeps_ = false;        // as its hello says
+  uint64_t peer_applied_ = 0;      // by its last hello
   uint64_t peer_incarnation_ = 0;  // 0: not met yet
   LinkStream* current_ = nullptr;
   int streams_ = 0;  // not yet released

@@ -24,6 +24,7 @@ class FakeAllocator final : public Allocator {
     auto server = std::make_unique<Server>();
     Server* s = server.get();
     s->region = start.region;
+    s->incarnation = start.incarnation;
     s->fake = std::make_unique<FakeRegion>(start.control, start.token, behaviour_);
     s->thread = std::thread([s] {
       s->exit = s->fake->Run();
@@ -37,7 +38,8 @@ class FakeAllocator final : public Allocator {
     for (const auto& s : servers_) {
       if (!s->ended || !s->thread.joinable()) continue;
       s->thread.join();
-      out.push_back({s->region, s->exit == 0, "exit status " + std::to_string(s->exit), "", "its last words"});
+      out.push_back(
+          {s->region, s->incarnation, s->exit == 0, "exit status " + std::to_string(s->exit), "", "its last words"});
     }
     return out;
   }
@@ -45,6 +47,11 @@ class FakeAllocator final : public Allocator {
     int n = 0;
     for (const auto& s : servers_) n += s->thread.joinable() ? 1 : 0;
     return n;
+  }
+  void End(RegionId region, uint64_t) override {
+    for (const auto& s : servers_) {
+      if (s->region == region) s->fake->Cancel();
+    }
   }
   void Kill() override {
     for (const auto& s : servers_) {
@@ -59,6 +66,7 @@ class FakeAllocator final : public Allocator {
  private:
   struct Server {
     RegionId region = kNoRegion;
+    uint64_t incarnation = 1;
     std::unique_ptr<FakeRegion> fake;
     std::thread thread;
     int exit = 0;

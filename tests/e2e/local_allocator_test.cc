@@ -44,17 +44,17 @@ class LocalAllocatorTest : public ::testing::Test {
 
 TEST_F(LocalAllocatorTest, ServerIsToldWhereToJoin) {
   LocalAllocator allocator({Program("echo \"$@\""), directory_ / "logs"});
-  ASSERT_TRUE(allocator.Start({4, "secret", "127.0.0.1:99"}).ok());
+  ASSERT_TRUE(allocator.Start({4, 1, "secret", "127.0.0.1:99"}).ok());
   const auto exits = WaitForExits(&allocator, 1);
   EXPECT_EQ(exits[0].region, 4);
   EXPECT_TRUE(exits[0].clean);
   EXPECT_EQ(TailOfFile(directory_ / "logs/region-4.log", 1),
-            "--control 127.0.0.1:99 --token secret --exit-with-parent");
+            "--control 127.0.0.1:99 --token secret --data " + (directory_ / "logs/region-4").string() + " --exit-with-parent");
 }
 
 TEST_F(LocalAllocatorTest, BadExitIsDescribedWithTheTailOfTheLog) {
   LocalAllocator allocator({Program("seq 1 50 >&2; exit 3"), directory_ / "logs"});
-  ASSERT_TRUE(allocator.Start({0, "t", "c"}).ok());
+  ASSERT_TRUE(allocator.Start({0, 1, "t", "c"}).ok());
   const auto exits = WaitForExits(&allocator, 1);
   EXPECT_FALSE(exits[0].clean);
   EXPECT_EQ(exits[0].how, "exit status 3");
@@ -65,13 +65,13 @@ TEST_F(LocalAllocatorTest, BadExitIsDescribedWithTheTailOfTheLog) {
 
 TEST_F(LocalAllocatorTest, SignalIsNamed) {
   LocalAllocator allocator({Program("kill -SEGV $$"), directory_ / "logs"});
-  ASSERT_TRUE(allocator.Start({0, "t", "c"}).ok());
+  ASSERT_TRUE(allocator.Start({0, 1, "t", "c"}).ok());
   EXPECT_EQ(WaitForExits(&allocator, 1)[0].how, "killed by signal 11 (Segmentation fault)");
 }
 
 TEST_F(LocalAllocatorTest, KillEndsServersAndTheirChildrenEvenWhenStopped) {
   LocalAllocator allocator({Program("trap '' TERM INT\nsleep 1000 &\necho $! >&2\nwait"), directory_ / "logs"});
-  ASSERT_TRUE(allocator.Start({0, "t", "c"}).ok());
+  ASSERT_TRUE(allocator.Start({0, 1, "t", "c"}).ok());
   const pid_t server = allocator.pids()[0];
   std::string child;
   while ((child = TailOfFile(directory_ / "logs/region-0.log", 1)).empty()) std::this_thread::yield();
@@ -89,7 +89,7 @@ TEST_F(LocalAllocatorTest, KillEndsServersAndTheirChildrenEvenWhenStopped) {
 
 TEST_F(LocalAllocatorTest, ServerIsInAGroupOfItsOwn) {
   LocalAllocator allocator({Program("exec sleep 1000"), directory_ / "logs"});
-  ASSERT_TRUE(allocator.Start({0, "t", "c"}).ok());
+  ASSERT_TRUE(allocator.Start({0, 1, "t", "c"}).ok());
   const pid_t server = allocator.pids()[0];
   EXPECT_EQ(getpgid(server), server);
   EXPECT_NE(getpgid(server), getpgrp());
@@ -102,7 +102,7 @@ TEST_F(LocalAllocatorTest, KernelEndsServersWhenTheParentIsKilled) {
   const pid_t parent = fork();
   if (parent == 0) {
     LocalAllocator allocator({program, directory_ / "logs"});
-    if (!allocator.Start({0, "t", "c"}).ok()) _exit(1);
+    if (!allocator.Start({0, 1, "t", "c"}).ok()) _exit(1);
     while (TailOfFile(allocator.LogFile(0), 1) != "ready") std::this_thread::yield();
     const pid_t server = allocator.pids()[0];
     if (write(pipe_ends[1], &server, sizeof server) != sizeof server) _exit(1);
@@ -124,7 +124,7 @@ TEST_F(LocalAllocatorTest, KernelEndsServersWhenTheParentIsKilled) {
 
 TEST_F(LocalAllocatorTest, MissingProgramIsSaidAndStartsNothing) {
   LocalAllocator allocator({directory_ / "nothing", ""});
-  const absl::Status s = allocator.Start({0, "t", "c"});
+  const absl::Status s = allocator.Start({0, 1, "t", "c"});
   EXPECT_TRUE(absl::IsNotFound(s)) << s;
   EXPECT_NE(s.message().find("nothing: No such file"), std::string::npos) << s;
   EXPECT_EQ(allocator.running(), 0);
@@ -134,13 +134,13 @@ TEST_F(LocalAllocatorTest, TemporaryLogsGoUnlessAServerEndedBadly) {
   fs::path kept, gone;
   {
     LocalAllocator good({Program("exit 0"), ""});
-    ASSERT_TRUE(good.Start({0, "t", "c"}).ok());
+    ASSERT_TRUE(good.Start({0, 1, "t", "c"}).ok());
     gone = good.LogFile(0).parent_path();
     WaitForExits(&good, 1);
   }
   {
     LocalAllocator bad({Program("exit 1"), ""});
-    ASSERT_TRUE(bad.Start({0, "t", "c"}).ok());
+    ASSERT_TRUE(bad.Start({0, 1, "t", "c"}).ok());
     kept = bad.LogFile(0).parent_path();
     WaitForExits(&bad, 1);
   }

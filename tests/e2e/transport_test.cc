@@ -23,11 +23,9 @@ LinkIdentity Identity(RegionId self) { return {kPeerProtocolVersion, 0xABCDEF, 3
 // One region's end: a server, and the link to its only peer.
 class End {
  public:
-  End(RegionId self, RegionId peer)
-      : link_({Identity(self), peer, deliver(), [this](RegionId, const std::string& s) {
-                 const std::lock_guard lock(mutex_);
-                 log_ += s + "\n";
-               }}) {
+  // `incarnation` > 0: one that makes checkpoints, and was loaded from one.
+  End(RegionId self, RegionId peer, uint64_t incarnation = 0, LinkState state = {})
+      : identity_(Identity(self)), link_(Options(peer, incarnation, std::move(state))) {
     grpc::ServerBuilder builder;
     ConfigureServer(&builder);
     builder.AddListeningPort("127.0.0.1:0", grpc::InsecureServerCredentials(), &port_);
@@ -35,7 +33,7 @@ class End {
     server_ = builder.BuildAndStart();
     std::vector<PeerLink*> links;
     if (peer < self) links.push_back(&link_);
-    service_.Serve(Identity(self), links);
+    service_.Serve(identity_, links);
   }
   ~End() {
     service_.Stop();
@@ -63,6 +61,14 @@ class End {
   }
 
  private:
+  PeerLink::Options Options(RegionId peer, uint64_t incarnation, LinkState state) {
+    identity_.incarnation = std::max<uint64_t>(1, incarnation);
+    const auto log = [this](RegionId, const std::string& s) {
+      const std::lock_guard lock(mutex_);
+      log_ += s + "\n";
+    };
+    return {identity_, peer, deliver(), log, incarnation > 0, std::move(state)};
+  }
   std::function<void(Frame)> deliver() {
     return [this](Frame frame) {
       const std::lock_guard lock(mutex_);
@@ -75,6 +81,7 @@ class End {
   std::condition_variable changed_;
   std::vector<Frame> frames_;
   std::string log_;
+  LinkIdentity identity_;
   PeerService service_;
   PeerLink link_;
   int port_ = 0;
@@ -258,7 +265,7 @@ TEST(Handshake, WhatDiffersIsNamed) {
     EXPECT_NE(verdict.error_message().find(what), std::string::npos) << verdict.error_message();
     EXPECT_EQ(high.service().refused(), ++refusals);
   };
-  refused("protocol version is 4 here and 9 in region 0", [](v1::LinkHello* h) { h->set_protocol_version(9); });
+  refused("protocol version is 5 here and 9 in region 0", [](v1::LinkHello* h) { h->set_protocol_version(9); });
   refused("world hash is 0000000000abcdef here and 0000000000000005", [](v1::LinkHello* h) { h->set_world_hash(5); });
   refused("layout epoch is 3 here and 4", [](v1::LinkHello* h) { h->set_layout_epoch(4); });
   refused("exchange delay is 0 here and 2", [](v1::LinkHello* h) { h->set_exchange_delay(2); });
@@ -277,11 +284,15 @@ TEST(Handshake, DiallerOfAnotherWorldIsRefusedAndCountsIt) {
   other.world_hash = 1;
   std::mutex mutex;
   std::string log;
-  PeerLink link({other, 1, [](Frame) { FAIL(); },
+  PeerLink link({other,
+                 1,
+                 [](Frame) { FAIL(); },
                  [&](RegionId, const std::string& s) {
                    const std::lock_guard lock(mutex);
                    log += s + "\n";
-                 }});
+                 },
+                 false,
+                 {}});
   link.Dial(high.endpoint());
   const auto deadline = std::chrono::steady_clock::now() + seconds(30);
   while (link.stats().refused_hellos < 2) {
@@ -294,7 +305,69 @@ TEST(Handshake, DiallerOfAnotherWorldIsRefusedAndCountsIt) {
   EXPECT_EQ(log.find('\n'), log.size() - 1) << "logged once, not at every attempt: " << log;
 }
 
-TEST(Handshake, RestartedPeerCannotGoOn) {
+TEST(PeerLink, RegionThatDiedGoesOnFromItsCheckpoint) {
+  End high(1, 0, 1);
+  auto low = std::make_unique<End>(0, 1, 1);
+  low->link().Dial(high.endpoint());
+  const auto send = [](End* end, Tick first, Tick last) {
+    for (Tick n = first; n <= last; ++n) end->Send(EmptyFrame(n));
+  };
+  send(low.get(), 1, 5);
+  send(&high, 1, 5);
+  ASSERT_TRUE(high.Await(5) && low->Await(5));
+  LinkState checkpoint = low->link().State();  // nothing is durable at the other side
+  EXPECT_EQ(checkpoint.kept.size(), 5);
+  checkpoint.applied = 3;  // it has used no more of them
+  low->link().SetDurable(2);
+  send(low.get(), 6, 8);
+  send(&high, 6, 9);
+  ASSERT_TRUE(high.Await(8) && low->Await(9));
+  while (high.link().stats().frames_kept > 7) std::this_thread::yield();  // those after the second
+
+  low.reset();
+  low = std::make_unique<End>(0, 1, 2, checkpoint);
+  low->link().Dial(high.endpoint());
+  ASSERT_TRUE(low->Await(6));  // 4 to 9 again
+  EXPECT_EQ(low->frames().front().tick, 4);
+  EXPECT_FALSE(low->link().caught_up());
+  send(low.get(), 6, 8);  // what the other side has had
+  EXPECT_TRUE(low->link().caught_up());
+  send(low.get(), 9, 9);
+  ASSERT_TRUE(high.Await(9));
+  EXPECT_EQ(high.frames().back().tick, 9);
+  EXPECT_EQ(high.link().stats().duplicates, 0);
+  send(&high, 10, 10);
+  ASSERT_TRUE(low->Await(7));
+  EXPECT_EQ(low->frames().back().tick, 10);
+  EXPECT_EQ(high.link().stats().refused_frames + low->link().stats().refused_frames, 0);
+}
+
+TEST(PeerLink, DiallerFollowsItsPeerToAnotherEndpoint) {
+  auto high = std::make_unique<End>(1, 0, 1);
+  End low(0, 1, 1);
+  low.link().Dial(high->endpoint());
+  low.Send(EmptyFrame(1));
+  ASSERT_TRUE(high->Await(1));
+  high = nullptr;
+  End moved(1, 0, 2);
+  low.link().Redirect(moved.endpoint(), 2);
+  ASSERT_TRUE(moved.Await(1));
+  low.Send(EmptyFrame(2));
+  ASSERT_TRUE(moved.Await(2));
+}
+
+TEST(Handshake, ReplacedIncarnationIsFenced) {
+  End high(1, 0, 1);
+  high.link().Redirect("", 3);
+  RawPeer raw(high.endpoint());
+  v1::LinkHello hello = RawPeer::Hello(0, 1);
+  hello.set_incarnation(2);
+  hello.set_keep(true);
+  raw.Say(hello);
+  EXPECT_NE(raw.Verdict().error_message().find("incarnation 3 is known: it has been replaced"), std::string::npos);
+}
+
+TEST(Handshake, RestartedPeerCannotGoOnWithoutCheckpoints) {
   End high(1, 0);
   {
     RawPeer raw(high.endpoint());

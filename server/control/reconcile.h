@@ -1,0 +1,56 @@
+// What the control plane does about its servers, as a pure function of what it sees: no clock, no process, no socket.
+#pragma once
+
+#include <cstdint>
+#include <string>
+#include <vector>
+
+#include "server/core/types.h"
+
+namespace aureole {
+
+// One region, as it is seen now.
+struct RegionObserved {
+  uint64_t incarnation = 0;  // of the newest server that was started for it; 0: none yet
+  bool alive = false;        // the allocator runs that server
+  bool joined = false;       // it has said Hello
+  bool connected = false;    // its stream is open
+  bool finished = false;     // it has reported its last tick
+  bool clean = false;        // not alive: it ended with exit status 0
+  double silent_s = 0;       // since it was last heard of, or was started
+  double down_s = 0;         // not alive: since it ended
+  int failures = 0;          // servers in a row that ended before they had lived for kStableSeconds
+  std::string how;           // not alive: how it ended
+};
+
+struct Observed {
+  bool recovers = false;  // regions make checkpoints
+  bool over = false;      // every region has finished, or was told to stop
+  std::vector<RegionObserved> regions;
+};
+
+struct Action {
+  enum class Kind {
+    kStart,  // a server with this incarnation, which fences all older ones
+    kEnd,    // the server with this incarnation, at once
+    kGiveUp  // the run cannot go on
+  };
+  Kind kind = Kind::kStart;
+  RegionId region = kNoRegion;
+  uint64_t incarnation = 0;
+  std::string why;
+};
+
+// A server whose stream has ended, or that says nothing for so long, is replaced. Far above what a server that is
+// stopped for a moment, or pages, needs.
+inline constexpr double kExitAfterLeaveSeconds = 3, kLeaseSeconds = 6;
+// From Hello on; a server may take longer to start.
+inline constexpr double kStableSeconds = 10;
+// Servers of one region that may end in a row before the run gives up, and the wait before the n-th of them: 0.1 s,
+// doubled each time, at most 10 s.
+inline constexpr int kMostFailures = 8;
+double BackOffSeconds(int failures);
+
+std::vector<Action> Reconcile(const Observed& observed);
+
+}  // namespace aureole
