@@ -109,6 +109,7 @@ void PeerLink::Dial(const std::string& endpoint) {
 
 // Holds the mutex.
 void PeerLink::OpenChannel(const std::string& endpoint) {
+  endpoint_ = endpoint;
   grpc::ChannelArguments arguments;
   arguments.SetInt(GRPC_ARG_ENABLE_HTTP_PROXY, 0);
   arguments.SetInt(GRPC_ARG_INITIAL_RECONNECT_BACKOFF_MS, kMinBackoffMs);
@@ -123,10 +124,12 @@ void PeerLink::OpenChannel(const std::string& endpoint) {
 
 void PeerLink::Redirect(const std::string& endpoint, uint64_t incarnation) {
   const std::lock_guard lock(mutex_);
-  if (closed_ || incarnation <= peer_incarnation_) return;
+  const bool newer = incarnation > peer_incarnation_;
+  const bool elsewhere = channel_ != nullptr && !endpoint.empty() && endpoint != endpoint_;
+  if (closed_ || incarnation < peer_incarnation_ || (!newer && !elsewhere)) return;
   peer_incarnation_ = incarnation;
-  peer_met_ = false;
-  if (channel_ != nullptr) {
+  if (newer) peer_met_ = false;
+  if (elsewhere) {
     old_channels_.push_back(channel_);
     OpenChannel(endpoint);
   }

@@ -117,8 +117,8 @@ class PeerLink {
 
   // Connects, and stays connected until Close. Once; only the side with the lower id.
   void Dial(const std::string& endpoint);
-  // From here on the peer is another incarnation, at this endpoint: older ones are refused, and when this side dials,
-  // it dials there. Ignored when a newer one is known.
+  // From here on the peer is this incarnation, at this endpoint: older ones are refused, and when this side dials, it
+  // dials there. Empty: not known yet. Ignored when a newer incarnation is known.
   void Redirect(const std::string& endpoint, uint64_t incarnation);
   // Any thread; never waits for the network.
   void Send(EncodedFrame frame);
@@ -167,6 +167,7 @@ class PeerLink {
   void Redial();
 
   const Options options_;
+  std::string endpoint_;
   std::shared_ptr<grpc::Channel> channel_;
   std::vector<std::shared_ptr<grpc::Channel>> old_channels_;  // kept as long as their streams may be (see Released)
   std::unique_ptr<v1::Peer::Stub> stub_;

@@ -48,8 +48,9 @@ TEST_F(LocalAllocatorTest, ServerIsToldWhereToJoin) {
   const auto exits = WaitForExits(&allocator, 1);
   EXPECT_EQ(exits[0].region, 4);
   EXPECT_TRUE(exits[0].clean);
-  EXPECT_EQ(TailOfFile(directory_ / "logs/region-4.log", 1),
-            "--control 127.0.0.1:99 --token secret --data " + (directory_ / "logs/region-4").string() + " --exit-with-parent");
+  EXPECT_EQ(TailOfFile(directory_ / "logs/region-4.log", 1), "--control 127.0.0.1:99 --token secret --data " +
+                                                                 (directory_ / "logs/region-4").string() +
+                                                                 " --exit-with-parent");
 }
 
 TEST_F(LocalAllocatorTest, BadExitIsDescribedWithTheTailOfTheLog) {
