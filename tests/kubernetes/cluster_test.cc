@@ -163,8 +163,8 @@ TEST_F(Cluster, WatchesEndInTimeAndVersionsThatAreTooOldAreGone) {
   const auto now = client_->List(worlds_);
   ASSERT_TRUE(now.ok());
   const auto watch = [&](const std::string& version) {
-    return client_->Watch(
-        worlds_, {}, version, seconds(1), {}, [] {}, [](const WatchEvent&) { return absl::OkStatus(); });
+    return client_->Watch(worlds_, {}, version, {.timeout = seconds(1)},
+                          [](const WatchEvent&) { return absl::OkStatus(); });
   };
   EXPECT_TRUE(watch(now->resource_version).ok());
   const absl::Status gone = watch("1");

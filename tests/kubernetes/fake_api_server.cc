@@ -411,10 +411,9 @@ void FakeApiServer::Watch(const httplib::Request& request, const Place& place, s
 
   struct Cursor {
     int64_t at = 0;
-    int cuts = 0, bookmarks = 0;
-    bool counted = false;
+    int cuts = 0, bookmarks = 0, releases = 0;
   };
-  auto cursor = std::make_shared<Cursor>(Cursor{*from, cuts_, bookmarks_, true});
+  auto cursor = std::make_shared<Cursor>(Cursor{*from, cuts_, bookmarks_, releases_});
   ++watches_;
   // Called again and again until it says that it is done, or fails, which cuts the connection.
   const auto provide = [=, this](size_t, httplib::DataSink& sink) mutable {
@@ -435,10 +434,13 @@ void FakeApiServer::Watch(const httplib::Request& request, const Place& place, s
         out = "<html>\n";
         fault.reset();
       } else {
+        const bool mute = fault && fault->kind == Kind::kMute;
+        if (mute) changed_.wait(lock, [&] { return stopping_ || releases_ != cursor->releases; });
         changed_.wait_until(lock, end, [&] {
-          return stopping_ || cursor->cuts != cuts_ || cursor->bookmarks != bookmarks_ || next() != history_.end();
+          return mute || stopping_ || cursor->cuts != cuts_ || cursor->bookmarks != bookmarks_ ||
+                 next() != history_.end();
         });
-        if (stopping_ || cursor->cuts != cuts_) {
+        if (mute || stopping_ || cursor->cuts != cuts_) {
           cut = true;
         } else if (const auto entry = next(); entry != history_.end()) {
           out = EventLine(entry->type, entry->object);

@@ -35,6 +35,7 @@ struct Fault {
     kHalfLine,     // a watch: its first event is cut in the middle, with the connection
     kGarbageLine,  // a watch: a line that is not JSON
     kErrorEvent,   // a watch: an ERROR event with `status`
+    kMute,         // a watch: begins, then says nothing any more and does not end
   };
   Kind kind = Kind::kStatus;
   std::string method = "GET", target = "";

@@ -66,6 +66,16 @@ class Elector {
   LeaderElection election_;
 };
 
+TEST(LeaderElection, TimingIsCheckedWithItsField) {
+  EXPECT_TRUE(CheckTiming({}).ok());
+  const auto message = [](int duration, int deadline, int retry) {
+    return std::string(CheckTiming({milliseconds(duration), milliseconds(deadline), milliseconds(retry)}).message());
+  };
+  EXPECT_EQ(message(15, 10, 0), "retry: is 0 ms, must be more than 0 ms");
+  EXPECT_EQ(message(15, 10, 10), "retry: is 10 ms, must be less than the renew deadline of 10 ms");
+  EXPECT_EQ(message(10, 10, 2), "renew_deadline: is 10 ms, must be less than the duration of 10 ms");
+}
+
 TEST(LeaderElection, FirstCandidateCreatesTheLeaseAndLeads) {
   Server server;
   Elector a(&server, "a");

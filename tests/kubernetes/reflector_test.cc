@@ -1,6 +1,15 @@
-// The copy follows the server whatever happens to the way between them.
+// The copy follows the server whatever happens to the way between them. The faults, one test each:
+//
+//   of a watch: cut in the middle of a line, and between lines; 410 as HTTP status and as ERROR event; other ERROR
+//     events, passing and lasting; a line that is not JSON; 500, 503, 429 with Retry-After, 403; a slow answer, none at
+//     all, and a watch that falls silent; an expired token (401) until its file is read again
+//   of a list: 500, 429 with Retry-After, a body and a JSON text that end too early
+//   of the server: not there for a while; history forgotten while nobody watched
 #include <gtest/gtest.h>
 
+#include <cstdlib>
+#include <filesystem>
+#include <fstream>
 #include <map>
 #include <set>
 
@@ -161,19 +170,21 @@ Fault OfWatch(Fault fault) {
 
 INSTANTIATE_TEST_SUITE_P(
     All, ReflectorFault,
-    testing::Values(FaultCase{"CutInTheMiddleOfALine", OfWatch({.kind = Kind::kHalfLine, .times = 3}), false},
-                    FaultCase{"GoneByHttpStatus", OfWatch({.kind = Kind::kStatus, .times = 2, .status = 410}), true},
-                    FaultCase{"GoneByErrorEvent", OfWatch({.kind = Kind::kGoneEvent, .times = 2}), true},
-                    FaultCase{"OtherErrorEvent", OfWatch({.kind = Kind::kErrorEvent, .status = 422}), true},
-                    FaultCase{"ServerErrorEvent", OfWatch({.kind = Kind::kErrorEvent, .status = 500}), false},
-                    FaultCase{"LineThatIsNotJson", OfWatch({.kind = Kind::kGarbageLine}), true},
-                    FaultCase{"Status500", OfWatch({.kind = Kind::kStatus, .times = 3, .status = 500}), false},
-                    FaultCase{"Status503", OfWatch({.kind = Kind::kStatus, .times = 3, .status = 503}), false},
-                    FaultCase{"Status429WithRetryAfter",
-                              OfWatch({.kind = Kind::kStatus, .status = 429, .retry_after = 1}), false},
-                    FaultCase{"Forbidden", OfWatch({.kind = Kind::kStatus, .status = 403}), true},
-                    FaultCase{"SlowAnswer", OfWatch({.kind = Kind::kSlow, .delay = milliseconds(300)}), false},
-                    FaultCase{"HangingAnswer", OfWatch({.kind = Kind::kHang}), false}),
+    testing::Values(
+        FaultCase{"CutInTheMiddleOfALine", OfWatch({.kind = Kind::kHalfLine, .times = 3}), false},
+        FaultCase{"GoneByHttpStatus", OfWatch({.kind = Kind::kStatus, .times = 2, .status = 410}), true},
+        FaultCase{"GoneByErrorEvent", OfWatch({.kind = Kind::kGoneEvent, .times = 2}), true},
+        FaultCase{"OtherErrorEvent", OfWatch({.kind = Kind::kErrorEvent, .status = 422}), true},
+        FaultCase{"ServerErrorEvent", OfWatch({.kind = Kind::kErrorEvent, .status = 500}), false},
+        FaultCase{"ServerErrorEventThatLasts",
+                  OfWatch({.kind = Kind::kErrorEvent, .times = Reflector::kMostFailures, .status = 500}), true},
+        FaultCase{"LineThatIsNotJson", OfWatch({.kind = Kind::kGarbageLine}), true},
+        FaultCase{"Status500", OfWatch({.kind = Kind::kStatus, .times = 3, .status = 500}), false},
+        FaultCase{"Status503", OfWatch({.kind = Kind::kStatus, .times = 3, .status = 503}), false},
+        FaultCase{"Status429WithRetryAfter", OfWatch({.kind = Kind::kStatus, .status = 429, .retry_after = 1}), false},
+        FaultCase{"Forbidden", OfWatch({.kind = Kind::kStatus, .status = 403}), false},
+        FaultCase{"SlowAnswer", OfWatch({.kind = Kind::kSlow, .delay = milliseconds(300)}), false},
+        FaultCase{"HangingAnswer", OfWatch({.kind = Kind::kHang}), false}),
     [](const auto& tested) { return std::string(tested.param.name); });
 
 // What a list meets is met at the start.
@@ -271,6 +282,45 @@ TEST(Reflector, WatchThatTheServerEndsInTimeIsTakenUp) {
   ASSERT_TRUE(Await([&] { return reflector.stats().watches == 3; }));
   EXPECT_EQ(reflector.stats().failures, 0);
   EXPECT_EQ(reflector.stats().lists, 1);
+}
+
+TEST(Reflector, SilentServerIsGivenUp) {
+  FakeApiServer server;
+  ApiClient client(server.Access());
+  Wakeup wakeup;
+  for (const Kind kind : {Kind::kHang, Kind::kMute}) {  // before the reply, and within
+    server.Remove(PathOf(0));
+    server.Inject({.kind = kind, .target = "watch=1"});
+    Reflector reflector(&client, {.resource = kPods, .watch_timeout = seconds(1), .watch_grace = milliseconds(200)},
+                        &wakeup);
+    ASSERT_TRUE(Await([&] { return reflector.synced() && server.faults_left() == 0; }));
+    server.Put(PathOf(0), Json::object());
+    EXPECT_TRUE(Await([&] { return reflector.objects().size() == 1; })) << reflector.health();
+    EXPECT_EQ(reflector.stats().failures, 1);
+  }
+  server.Release();
+}
+
+TEST(Reflector, GoesOnWhenAnExpiredTokenIsReplaced) {
+  std::string directory = (std::filesystem::temp_directory_path() / "token.XXXXXX").string();
+  const std::string file = std::string(mkdtemp(directory.data())) + "/token";
+  const auto write = [&](const std::string& token) { std::ofstream(file) << token; };
+  write("old");
+  FakeApiServer server;
+  server.AcceptOnly("old");
+  ClusterAccess access = server.Access();
+  access.token_file = file;
+  {
+    Reflecting r(&server, access);
+    ASSERT_TRUE(r.AwaitEqual() && r.AwaitWatch());
+    server.AcceptOnly("new");
+    server.CutWatches();
+    Stir(server, 1);
+    ASSERT_TRUE(Await([&] { return absl::IsUnauthenticated(r.reflector().health()); }));
+    write("new");
+    ASSERT_TRUE(r.AwaitEqual()) << r.reflector().health();
+  }
+  std::filesystem::remove_all(directory);
 }
 
 TEST(Reflector, StopsAtOnceWithinAHangingRead) {

@@ -216,27 +216,25 @@ absl::Status ApiClient::Exchange(HttpRequest* request, const std::stop_token& st
 }
 
 absl::Status ApiClient::Watch(const Resource& resource, const Selection& selection, const std::string& resource_version,
-                              std::chrono::seconds timeout, const std::stop_token& stop,
-                              const std::function<void()>& opened,
-                              const std::function<absl::Status(WatchEvent)>& take) {
+                              const WatchOptions& options, const std::function<absl::Status(WatchEvent)>& take) {
   const std::string path = resource.CollectionPath();
   HttpRequest request{.method = "GET",
                       .url = absl::StrCat(access_.server, path,
                                           Query({{"watch", "1"},
                                                  {"resourceVersion", resource_version},
                                                  {"allowWatchBookmarks", "true"},
-                                                 {"timeoutSeconds", absl::StrCat(timeout.count())},
+                                                 {"timeoutSeconds", absl::StrCat(options.timeout.count())},
                                                  {"labelSelector", selection.labels},
                                                  {"fieldSelector", selection.fields}})),
                       .headers = {"Accept: application/json"},
-                      .timeout = timeout + kWatchGrace,
-                      .header_timeout = kWatchGrace};
+                      .timeout = options.timeout + options.grace,
+                      .header_timeout = options.grace};
   const std::string what = absl::StrCat("watch ", path);
   absl::Status taken;
   std::string line;  // the part that has come
   HttpReply reply;
-  const absl::Status exchanged = Exchange(&request, stop, &reply, [&](const char* part, size_t bytes) {
-    if (bytes == 0) opened();
+  const absl::Status exchanged = Exchange(&request, options.stop, &reply, [&](const char* part, size_t bytes) {
+    if (bytes == 0) options.opened();
     const char* const end = part + bytes;
     while (taken.ok() && part != end) {
       const char* const newline = std::find(part, end, '\n');

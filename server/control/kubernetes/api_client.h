@@ -68,6 +68,14 @@ struct WatchEvent {
   Json object;  // of a bookmark: nothing but metadata.resourceVersion
 };
 
+struct WatchOptions {
+  std::chrono::seconds timeout{300};  // the server ends the watch after that
+  // For the reply to begin, and for the end after `timeout`: a server that is silent beyond that is given up.
+  std::chrono::milliseconds grace{10000};
+  std::stop_token stop = {};
+  std::function<void()> opened = [] {};  // called when the server has agreed
+};
+
 struct ApiStats {
   int64_t requests = 0;        // sent or tried
   int64_t repeated = 0;        // of these, because the one before had failed
@@ -76,8 +84,7 @@ struct ApiStats {
 
 class ApiClient {
  public:
-  static constexpr int kPage = 500;  // objects per request of a list
-  static constexpr std::chrono::seconds kWatchGrace{10};
+  static constexpr int kPage = 500;                      // objects per request of a list
   static constexpr size_t kMostLine = size_t{16} << 20;  // bytes of a watch event; more is an error
 
   explicit ApiClient(ClusterAccess access);
@@ -107,13 +114,11 @@ class ApiClient {
   absl::Status Delete(const Resource& resource, const std::string& name, const DeleteOptions& what = {},
                       const CallOptions& options = {});
 
-  // Everything that happens after `resource_version`, in order, until `timeout` is over (OK), `stop` (Cancelled), or
-  // `take` returns an error (that). OutOfRange: the server has forgotten that version, by either form of 410: list
+  // Everything that happens after `resource_version`, in order, until the watch times out (OK), is stopped (Cancelled),
+  // or `take` returns an error (that). OutOfRange: the server has forgotten that version, by either form of 410: list
   // again. Unavailable: broken; what `take` got is whole and in order, so go on from its last version. One try.
-  // `opened` is called when the server has agreed.
   absl::Status Watch(const Resource& resource, const Selection& selection, const std::string& resource_version,
-                     std::chrono::seconds timeout, const std::stop_token& stop, const std::function<void()>& opened,
-                     const std::function<absl::Status(WatchEvent)>& take);
+                     const WatchOptions& options, const std::function<absl::Status(WatchEvent)>& take);
 
  private:
   struct Request {

@@ -140,6 +140,7 @@ absl::Status HttpConnection::Perform(const HttpRequest& request, const std::stop
   SetBlob(easy, CURLOPT_SSLCERT_BLOB, access_.client_certificate);
   SetBlob(easy, CURLOPT_SSLKEY_BLOB, access_.client_key);
   curl_easy_setopt(easy, CURLOPT_NOSIGNAL, 1L);
+  curl_easy_setopt(easy, CURLOPT_QUICK_EXIT, 1L);  // a stop does not wait for a look-up of the server's name
   curl_easy_setopt(easy, CURLOPT_SOCKOPTFUNCTION, SetSocketOptions);
   curl_easy_setopt(easy, CURLOPT_CONNECTTIMEOUT_MS,
                    static_cast<long>(std::chrono::milliseconds(kConnectTimeout).count()));

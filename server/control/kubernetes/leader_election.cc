@@ -3,17 +3,33 @@
 #include <algorithm>
 #include <utility>
 
+#include <absl/strings/str_cat.h>
+
 #include "server/core/check.h"
 
 namespace aureole::kubernetes {
 
+absl::Status CheckTiming(const ElectionTiming& timing) {
+  const auto refuse = [](const char* field, std::chrono::milliseconds is, const char* than,
+                         std::chrono::milliseconds limit) {
+    return absl::InvalidArgumentError(
+        absl::StrCat(field, ": is ", is.count(), " ms, must be ", than, " ", limit.count(), " ms"));
+  };
+  if (timing.retry.count() <= 0) return refuse("retry", timing.retry, "more than", {});
+  if (timing.retry >= timing.renew_deadline) {
+    return refuse("retry", timing.retry, "less than the renew deadline of", timing.renew_deadline);
+  }
+  if (timing.renew_deadline >= timing.duration) {
+    return refuse("renew_deadline", timing.renew_deadline, "less than the duration of", timing.duration);
+  }
+  return absl::OkStatus();
+}
+
 LeaderElection::LeaderElection(std::string identity, ElectionTiming timing)
     : identity_(std::move(identity)), timing_(timing) {
   AUREOLE_CHECK(!identity_.empty(), "an elector without an identity");
-  AUREOLE_CHECK(
-      timing_.retry.count() > 0 && timing_.retry < timing_.renew_deadline && timing_.renew_deadline < timing_.duration,
-      "retry %ld ms, renew deadline %ld ms, duration %ld ms", static_cast<long>(timing_.retry.count()),
-      static_cast<long>(timing_.renew_deadline.count()), static_cast<long>(timing_.duration.count()));
+  const absl::Status checked = CheckTiming(timing_);
+  AUREOLE_CHECK(checked.ok(), "%s", checked.ToString().c_str());
 }
 
 LeaderElection::Step LeaderElection::Next(Time now) {

@@ -17,6 +17,8 @@
 #include <optional>
 #include <string>
 
+#include <absl/status/status.h>
+
 #include "server/control/kubernetes/boot_clock.h"
 #include "server/control/kubernetes/lease.h"
 
@@ -28,12 +30,15 @@ struct ElectionTiming {
   std::chrono::milliseconds retry{2000};            // between renewals, and between looks of a candidate
 };
 
+// InvalidArgument, with the field, unless 0 < retry < renew_deadline < duration.
+absl::Status CheckTiming(const ElectionTiming& timing);
+
 class LeaderElection {
  public:
   using Time = BootClock::time_point;
 
   // `identity` must be that of this process only: another one of the same name would take its lease at once. A timing
-  // that is not 0 < retry < renew_deadline < duration stops the process.
+  // that CheckTiming refuses stops the process.
   LeaderElection(std::string identity, ElectionTiming timing);
 
   enum class Action : uint8_t {

@@ -7,6 +7,15 @@
 #include "server/control/kubernetes/backoff.h"
 
 namespace aureole::kubernetes {
+namespace {
+
+// The way to the server, or what we may there, is not as it should be: that leaves our version as good as it was.
+bool LeavesVersion(const absl::Status& status) {
+  return absl::IsUnavailable(status) || absl::IsFailedPrecondition(status) || absl::IsUnauthenticated(status) ||
+         absl::IsPermissionDenied(status);
+}
+
+}  // namespace
 
 Reflector::Reflector(ApiClient* client, Options options, Wakeup* wakeup)
     : client_(client),
@@ -48,18 +57,23 @@ ReflectorStats Reflector::stats() const {
 
 void Reflector::Run(const std::stop_token& stop) {
   Backoff backoff(options_.first_pause, options_.longest_pause);
+  int failures = 0;  // in a row
   while (!stop.stop_requested()) {
     bool moved = false;
     const bool listing = version_.empty();
     const absl::Status status = listing ? ListAll(stop) : WatchOnce(stop, &moved);
     if (stop.stop_requested()) return;
     Settle(status);
-    if (moved) backoff.Reset();
-    if (listing && status.ok()) continue;
-    // A broken way leaves what we have valid. Anything else (410 above all) needs a new list.
-    if (!status.ok() && !absl::IsUnavailable(status)) version_.clear();
-    // Also after a watch that ended well: a server that ends each at once must not be asked in a tight loop.
-    if (status.ok() && moved) continue;
+    if (moved) {
+      backoff.Reset();
+      failures = 0;
+    }
+    if (status.ok() && (listing || moved)) continue;
+    // Also after a watch that ended well, but soon: a server that does so must not be asked in a tight loop.
+    if (!status.ok() && (!LeavesVersion(status) || ++failures >= kMostFailures)) {
+      version_.clear();
+      failures = 0;
+    }
     const std::chrono::milliseconds asked = RetryAfterOf(status).value_or(std::chrono::seconds(0));
     if (!Pause(stop, std::max(asked, backoff.Next()))) return;
   }
@@ -88,10 +102,12 @@ absl::Status Reflector::WatchOnce(const std::stop_token& stop, bool* moved) {
     ++stats_.watches;
   }
   const auto began = std::chrono::steady_clock::now();
-  const absl::Status status = client_->Watch(
-      options_.resource, options_.selection, version_, options_.watch_timeout, stop,
-      [this] { Settle(absl::OkStatus()); },
-      [&](WatchEvent event) {
+  const WatchOptions options{
+      .timeout = options_.watch_timeout, .grace = options_.watch_grace, .stop = stop, .opened = [this] {
+        Settle(absl::OkStatus());
+      }};
+  const absl::Status status =
+      client_->Watch(options_.resource, options_.selection, version_, options, [&](WatchEvent event) {
         *moved = true;
         return TakeEvent(std::move(event));
       });

@@ -2,8 +2,9 @@
 // whatever happens to the server and the way to it.
 //
 // A watch that ends or breaks is taken up after the last version seen (bookmarks too). When the server has forgotten
-// that version (410) or says what cannot be understood, everything is listed again, and what is gone meanwhile is
-// reported as deleted. Versions are never compared but for equality.
+// that version (410), says what cannot be understood, or has failed kMostFailures times in a row from that version on,
+// everything is listed again, and what is gone meanwhile is reported as deleted. Versions are never compared but for
+// equality.
 #pragma once
 
 #include <chrono>
@@ -32,10 +33,13 @@ struct ReflectorStats {
 
 class Reflector {
  public:
+  static constexpr int kMostFailures = 5;
+
   struct Options {
     Resource resource;
     Selection selection = {};
-    std::chrono::seconds watch_timeout{300};                           // the server ends each watch after that
+    std::chrono::seconds watch_timeout{300};  // WatchOptions
+    std::chrono::milliseconds watch_grace{10000};
     std::chrono::milliseconds first_pause{100}, longest_pause{30000};  // after failures
   };
 
