@@ -288,10 +288,11 @@ TEST(Reflector, SilentServerIsGivenUp) {
   FakeApiServer server;
   ApiClient client(server.Access());
   Wakeup wakeup;
-  for (const Kind kind : {Kind::kHang, Kind::kMute}) {  // before the reply, and within
+  const std::pair<Kind, seconds> cases[] = {{Kind::kHang, seconds(300)}, {Kind::kMute, seconds(1)}};
+  for (const auto& [kind, timeout] : cases) {  // before the reply, and within
     server.Remove(PathOf(0));
     server.Inject({.kind = kind, .target = "watch=1"});
-    Reflector reflector(&client, {.resource = kPods, .watch_timeout = seconds(1), .watch_grace = milliseconds(200)},
+    Reflector reflector(&client, {.resource = kPods, .watch_timeout = timeout, .watch_grace = milliseconds(200)},
                         &wakeup);
     ASSERT_TRUE(Await([&] { return reflector.synced() && server.faults_left() == 0; }));
     server.Put(PathOf(0), Json::object());
@@ -299,6 +300,20 @@ TEST(Reflector, SilentServerIsGivenUp) {
     EXPECT_EQ(reflector.stats().failures, 1);
   }
   server.Release();
+}
+
+TEST(Reflector, EventsOfAnySizeArriveWhole) {
+  FakeApiServer server;
+  Reflecting r(&server);
+  ASSERT_TRUE(r.AwaitEqual() && r.AwaitWatch());
+  for (int i = 0; i < 20; ++i) {
+    server.Put(PathOf(i), {{"spec", std::string(size_t{1} << i, static_cast<char>('a' + i))}});
+  }
+  ASSERT_TRUE(r.AwaitEqual()) << r.reflector().health();
+  EXPECT_EQ(r.reflector().stats().failures, 0);
+  for (const Json& object : server.All(kCollection)) {
+    EXPECT_EQ(*r.reflector().objects()["test/" + TextAt(object, {"metadata", "name"})], object);
+  }
 }
 
 TEST(Reflector, GoesOnWhenAnExpiredTokenIsReplaced) {
