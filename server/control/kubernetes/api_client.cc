@@ -186,7 +186,7 @@ absl::StatusOr<Json> ApiClient::CallOnce(const Request& request, milliseconds ti
                    .timeout = timeout};
   if (!request.content_type.empty()) http.headers.push_back("Content-Type: " + request.content_type);
   HttpReply reply;
-  const absl::Status exchanged = Exchange(&http, stop, &reply, nullptr);
+  absl::Status exchanged = Exchange(&http, stop, &reply, nullptr);
   *acted_on = reply.sent && reply.status != 429;
   if (!exchanged.ok()) return exchanged;
   const std::string what = absl::StrCat(request.method, " ", request.path);
@@ -233,7 +233,7 @@ absl::Status ApiClient::Watch(const Resource& resource, const Selection& selecti
   absl::Status taken;
   std::string line;  // the part that has come
   HttpReply reply;
-  const absl::Status exchanged = Exchange(&request, options.stop, &reply, [&](const char* part, size_t bytes) {
+  absl::Status exchanged = Exchange(&request, options.stop, &reply, [&](const char* part, size_t bytes) {
     if (bytes == 0) options.opened();
     const char* const end = part + bytes;
     while (taken.ok() && part != end) {

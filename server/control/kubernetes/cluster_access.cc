@@ -38,7 +38,7 @@ absl::Status CheckPem(const std::string& pem, const std::string& file, const std
 // yaml-cpp throws; nothing of it leaves this class.
 class Kubeconfig {
  public:
-  Kubeconfig(std::string path, YAML::Node root) : path_(std::move(path)), root_(std::move(root)) {}
+  Kubeconfig(std::string path, const YAML::Node& root) : path_(std::move(path)), root_(root) {}
 
   absl::StatusOr<ClusterAccess> Access() {
     const std::string current = Text(root_, "current-context");

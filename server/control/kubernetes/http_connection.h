@@ -2,7 +2,6 @@
 // no redirects.
 #pragma once
 
-#include <atomic>
 #include <chrono>
 #include <functional>
 #include <memory>

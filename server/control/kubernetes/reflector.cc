@@ -106,11 +106,10 @@ absl::Status Reflector::WatchOnce(const std::stop_token& stop, bool* moved) {
       .timeout = options_.watch_timeout, .grace = options_.watch_grace, .stop = stop, .opened = [this] {
         Settle(absl::OkStatus());
       }};
-  const absl::Status status =
-      client_->Watch(options_.resource, options_.selection, version_, options, [&](WatchEvent event) {
-        *moved = true;
-        return TakeEvent(std::move(event));
-      });
+  absl::Status status = client_->Watch(options_.resource, options_.selection, version_, options, [&](WatchEvent event) {
+    *moved = true;
+    return TakeEvent(std::move(event));
+  });
   if (status.ok() && std::chrono::steady_clock::now() - began >= std::chrono::seconds(1)) *moved = true;
   return status;
 }
