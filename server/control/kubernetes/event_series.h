@@ -32,7 +32,7 @@ struct Event {
 };
 
 // A request: create `object` when `name` is empty, else merge `object` into the event of that name.
-struct EventWrite {
+struct EventWrite {  // NOLINT(bugprone-exception-escape): clang-tidy doubts the move of nlohmann::json
   Event event;
   std::string space, name;
   Json object;
