@@ -5,11 +5,11 @@
 #include <absl/strings/str_cat.h>
 #include <absl/strings/str_format.h>
 #include <grpcpp/create_channel.h>
-#include <grpcpp/security/credentials.h>
 
 #include "server/core/check.h"
 #include "server/transport/frame_codec.h"
 #include "server/transport/link_limits.h"
+#include "server/transport/server_certificate.h"
 
 namespace aureole {
 namespace {
@@ -99,10 +99,11 @@ PeerLink::PeerLink(Options options)
 
 PeerLink::~PeerLink() { Close(); }
 
-void PeerLink::Dial(const std::string& endpoint) {
+void PeerLink::Dial(const std::string& endpoint, const std::shared_ptr<grpc::ChannelCredentials>& credentials) {
   AUREOLE_CHECK(options_.identity.self < options_.peer && channel_ == nullptr, "region %d dials region %d",
                 options_.identity.self, options_.peer);
   const std::lock_guard lock(mutex_);
+  credentials_ = credentials;
   OpenChannel(endpoint);
   Connect();
 }
@@ -112,13 +113,14 @@ void PeerLink::OpenChannel(const std::string& endpoint) {
   endpoint_ = endpoint;
   grpc::ChannelArguments arguments;
   arguments.SetInt(GRPC_ARG_ENABLE_HTTP_PROXY, 0);
+  arguments.SetSslTargetNameOverride(kServerName);
   arguments.SetInt(GRPC_ARG_INITIAL_RECONNECT_BACKOFF_MS, kMinBackoffMs);
   arguments.SetInt(GRPC_ARG_MIN_RECONNECT_BACKOFF_MS, kMinBackoffMs);
   arguments.SetInt(GRPC_ARG_MAX_RECONNECT_BACKOFF_MS, kMaxBackoffMs);
   arguments.SetInt(GRPC_ARG_KEEPALIVE_TIME_MS, kKeepaliveSeconds * 1000);
   arguments.SetInt(GRPC_ARG_KEEPALIVE_TIMEOUT_MS, kKeepaliveTimeoutSeconds * 1000);
   arguments.SetMaxReceiveMessageSize(kMaxMessageBytes);
-  channel_ = grpc::CreateCustomChannel(endpoint, grpc::InsecureChannelCredentials(), arguments);
+  channel_ = grpc::CreateCustomChannel(endpoint, credentials_, arguments);
   stub_ = v1::Peer::NewStub(channel_);
 }
 

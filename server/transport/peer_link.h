@@ -23,6 +23,7 @@
 #include <absl/status/statusor.h>
 #include <grpcpp/alarm.h>
 #include <grpcpp/channel.h>
+#include <grpcpp/security/credentials.h>
 
 #include "aureole/v1/peer.grpc.pb.h"
 #include "server/core/frame.h"
@@ -116,7 +117,8 @@ class PeerLink {
   RegionId peer() const { return options_.peer; }
 
   // Connects, and stays connected until Close. Once; only the side with the lower id.
-  void Dial(const std::string& endpoint);
+  void Dial(const std::string& endpoint,
+            const std::shared_ptr<grpc::ChannelCredentials>& credentials = grpc::InsecureChannelCredentials());
   // From here on the peer is this incarnation, at this endpoint: older ones are refused, and when this side dials, it
   // dials there. Empty: not known yet. Ignored when a newer incarnation is known.
   void Redirect(const std::string& endpoint, uint64_t incarnation);
@@ -168,6 +170,7 @@ class PeerLink {
 
   const Options options_;
   std::string endpoint_;
+  std::shared_ptr<grpc::ChannelCredentials> credentials_;
   std::shared_ptr<grpc::Channel> channel_;
   std::vector<std::shared_ptr<grpc::Channel>> old_channels_;  // kept as long as their streams may be (see Released)
   std::unique_ptr<v1::Peer::Stub> stub_;

@@ -125,6 +125,7 @@ grpc::Status PlayStream::TakeWatch(const Path& path, const v1::StreamReplicasReq
 }
 
 grpc::Status PlayStream::TakeInputs(const Path& path, const v1::ImpulseBatch& batch) {
+  if (!rights_.Has(v1::Token::PUSH)) return NoRight(path.str(), v1::Token::PUSH);
   const auto all = static_cast<size_t>(batch.impulse_size());
   {
     // Before they are offered: outcomes may come at once.

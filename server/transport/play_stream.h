@@ -11,6 +11,7 @@
 #include <grpcpp/support/byte_buffer.h>
 #include <grpcpp/support/server_callback.h>
 
+#include "server/transport/guard.h"
 #include "server/transport/input_service.h"
 #include "server/transport/replica_publisher.h"
 
@@ -24,7 +25,8 @@ class PlayStream final : public grpc::ServerBidiReactor<grpc::ByteBuffer, grpc::
   static constexpr size_t kMostUnacknowledged = 8;
   static constexpr std::chrono::seconds kLongestSilence{10};
 
-  // The reactor of a call. It lives until the call is done and the publisher has let go of it.
+  // The reactor of a call, with the rights of its caller. It lives until the call is done and the publisher has let go
+  // of it.
   static std::shared_ptr<PlayStream> Start(grpc::CallbackServerContext* context, InputService* inputs,
                                            ReplicaPublisher* replicas, int64_t tick_us);
 
@@ -57,6 +59,7 @@ class PlayStream final : public grpc::ServerBidiReactor<grpc::ByteBuffer, grpc::
   InputService* const inputs_;
   ReplicaPublisher* const replicas_;
   const int64_t tick_us_;
+  const Rights rights_ = RightsOfCaller();
   uint64_t client_ = 0;  // of reads only
   int requests_ = 0;     // likewise
   grpc::ByteBuffer in_;
