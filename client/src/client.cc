@@ -10,9 +10,8 @@
 #include <thread>
 #include <unordered_map>
 
-#include <grpcpp/create_channel.h>
-
 #include "aureole/v1/simulation.grpc.pb.h"
+#include "client/src/channel.h"
 #include "client/src/convert.h"
 #include "client/src/push_sender.h"
 #include "client/src/region_watch.h"
@@ -111,8 +110,11 @@ Body At(uint64_t id, const MergedBody& b, double tick, double tick_seconds) {
 }  // namespace
 
 struct Client::Impl {
-  Impl(World w, std::vector<std::string> endpoints)
-      : world(std::move(w)), pushes(std::move(endpoints), RandomClient()), calls_client(RandomClient()) {}
+  Impl(World w, std::vector<std::string> endpoints, Access a)
+      : world(std::move(w)),
+        access(std::move(a)),
+        pushes(std::move(endpoints), RandomClient(), access),
+        calls_client(RandomClient()) {}
 
   void OnFrame(int32_t region, const v1::ReplicaFrame& frame, const ReplicaDecoder& decoder, bool fresh);
   void Follow(int64_t tick);
@@ -122,6 +124,7 @@ struct Client::Impl {
               const Request& request, Response* response, double timeout_seconds);
 
   const World world;
+  const Access access;
   PushSender pushes;
 
   // Spawns and removals, one at a time.
@@ -196,7 +199,7 @@ Status Client::Impl::Call(grpc::Status (v1::Simulation::Stub::*method)(grpc::Cli
   const auto deadline = Deadline(timeout_seconds);
   for (size_t server = 0;; ++server) {
     const std::string& endpoint = world.regions[server % world.regions.size()].endpoint;
-    const auto stub = v1::Simulation::NewStub(grpc::CreateChannel(endpoint, grpc::InsecureChannelCredentials()));
+    const auto stub = v1::Simulation::NewStub(ChannelTo(endpoint, access));
     grpc::ClientContext context;
     context.set_deadline(deadline);
     response->Clear();
@@ -207,8 +210,9 @@ Status Client::Impl::Call(grpc::Status (v1::Simulation::Stub::*method)(grpc::Cli
   }
 }
 
-Status Client::Connect(const std::string& server, std::unique_ptr<Client>* client, double timeout_seconds) {
-  const auto stub = v1::Simulation::NewStub(grpc::CreateChannel(server, grpc::InsecureChannelCredentials()));
+Status Client::Connect(const std::string& server, std::unique_ptr<Client>* client, double timeout_seconds,
+                       const Access& access) {
+  const auto stub = v1::Simulation::NewStub(ChannelTo(server, access));
   grpc::ClientContext context;
   context.set_deadline(Deadline(timeout_seconds));
   context.set_wait_for_ready(true);
@@ -219,7 +223,7 @@ Status Client::Connect(const std::string& server, std::unique_ptr<Client>* clien
   for (const World::Region& r : world.regions) {
     if (r.endpoint != server) endpoints.push_back(r.endpoint);
   }
-  client->reset(new Client(std::make_unique<Impl>(std::move(world), std::move(endpoints))));
+  client->reset(new Client(std::make_unique<Impl>(std::move(world), std::move(endpoints), access)));
   return {};
 }
 
@@ -259,7 +263,7 @@ Status Client::Watch(const WatchOptions& options) {
       ++(up ? impl->counts.connections : impl->counts.lost_connections);
     };
     impl_->watches.push_back(
-        std::make_unique<RegionWatch>(impl_->world.regions[r].endpoint, request, std::move(events)));
+        std::make_unique<RegionWatch>(impl_->world.regions[r].endpoint, impl_->access, request, std::move(events)));
   }
   return {};
 }
@@ -356,8 +360,7 @@ Status Client::CastRay(const Vec3& origin, const Vec3& direction, double length,
   std::vector<std::thread> threads;
   for (size_t i = 0; i < answers.size(); ++i) {
     threads.emplace_back([&, i] {
-      const auto stub = v1::Simulation::NewStub(
-          grpc::CreateChannel(impl_->world.regions[i].endpoint, grpc::InsecureChannelCredentials()));
+      const auto stub = v1::Simulation::NewStub(ChannelTo(impl_->world.regions[i].endpoint, impl_->access));
       grpc::ClientContext context;
       context.set_deadline(Deadline(timeout_seconds));
       answers[i].status = stub->CastRays(&context, request, &answers[i].response);

@@ -4,8 +4,7 @@
 #include <chrono>
 #include <cstdio>
 
-#include <grpcpp/create_channel.h>
-
+#include "client/src/channel.h"
 #include "client/src/convert.h"
 
 namespace aureole::client {
@@ -16,8 +15,8 @@ constexpr std::chrono::milliseconds kBackoff(100);
 
 }  // namespace
 
-PushSender::PushSender(std::vector<std::string> endpoints, uint64_t client)
-    : endpoints_(std::move(endpoints)), client_(client), thread_([this] { Run(); }) {}
+PushSender::PushSender(std::vector<std::string> endpoints, uint64_t client, Access access)
+    : endpoints_(std::move(endpoints)), client_(client), access_(std::move(access)), thread_([this] { Run(); }) {}
 
 PushSender::~PushSender() {
   {
@@ -75,7 +74,7 @@ void PushSender::Run() {
 }
 
 void PushSender::Serve(const std::string& endpoint) {
-  const auto stub = v1::Simulation::NewStub(grpc::CreateChannel(endpoint, grpc::InsecureChannelCredentials()));
+  const auto stub = v1::Simulation::NewStub(ChannelTo(endpoint, access_));
   const auto stream = stub->Play(context_.get());
   std::thread reader([this, &stream] { ReadOutcomes(stream.get()); });
   Sent sent;
@@ -134,8 +133,15 @@ void PushSender::Settle(const v1::InputOutcomes& outcomes) {
 
 // A push that cannot be is not sent again.
 void PushSender::Refuse(const Sent& sent, const grpc::Status& status) {
-  if (status.error_code() != grpc::StatusCode::INVALID_ARGUMENT) return;
   const Status why = FromGrpc(status);
+  if (status.error_code() == grpc::StatusCode::UNAUTHENTICATED ||
+      status.error_code() == grpc::StatusCode::PERMISSION_DENIED) {
+    for (const std::vector<uint64_t>& message : sent) {
+      for (uint64_t sequence : message) Reject(sequence, why.reason);
+    }
+    return;
+  }
+  if (status.error_code() != grpc::StatusCode::INVALID_ARGUMENT) return;
   size_t request = 0, impulse = 0;
   if (std::sscanf(why.field.c_str(), "request[%zu].inputs.impulse[%zu]", &request, &impulse) == 2 &&
       request < sent.size() && impulse < sent[request].size()) {

@@ -21,7 +21,7 @@ namespace aureole::client {
 
 class PushSender {
  public:
-  PushSender(std::vector<std::string> endpoints, uint64_t client);
+  PushSender(std::vector<std::string> endpoints, uint64_t client, Access access = {});
   ~PushSender();
 
   void Send(const Push& push);
@@ -48,6 +48,7 @@ class PushSender {
 
   const std::vector<std::string> endpoints_;
   const uint64_t client_;
+  const Access access_;
 
   mutable std::mutex mutex_;
   std::condition_variable changed_;

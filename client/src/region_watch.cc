@@ -4,26 +4,28 @@
 #include <chrono>
 #include <utility>
 
-#include <grpcpp/create_channel.h>
 #include <grpcpp/support/channel_arguments.h>
+
+#include "client/src/channel.h"
 
 namespace aureole::client {
 namespace {
 
 constexpr std::chrono::milliseconds kMinBackoff(50), kMaxBackoff(1000);
 
-std::shared_ptr<grpc::Channel> Connect(const std::string& endpoint) {
+std::shared_ptr<grpc::Channel> Connect(const std::string& endpoint, const Access& access) {
   grpc::ChannelArguments arguments;
   // Frames that lie on the way are old frames: the window stays small.
   arguments.SetInt(GRPC_ARG_HTTP2_BDP_PROBE, 0);
   arguments.SetMaxReceiveMessageSize(-1);
-  return grpc::CreateCustomChannel(endpoint, grpc::InsecureChannelCredentials(), arguments);
+  return ChannelTo(endpoint, access, std::move(arguments));
 }
 
 }  // namespace
 
-RegionWatch::RegionWatch(std::string endpoint, v1::StreamReplicasRequest request, Events events)
+RegionWatch::RegionWatch(std::string endpoint, Access access, v1::StreamReplicasRequest request, Events events)
     : endpoint_(std::move(endpoint)),
+      access_(std::move(access)),
       events_(std::move(events)),
       request_(std::move(request)),
       thread_([this] { Run(); }) {}
@@ -45,7 +47,7 @@ void RegionWatch::Want(const v1::StreamReplicasRequest& request) {
 }
 
 void RegionWatch::Run() {
-  const std::shared_ptr<grpc::Channel> channel = Connect(endpoint_);
+  const std::shared_ptr<grpc::Channel> channel = Connect(endpoint_, access_);
   const auto stub = v1::Simulation::NewStub(channel);
   std::chrono::milliseconds backoff = kMinBackoff;
   while (true) {

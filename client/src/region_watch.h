@@ -10,6 +10,7 @@
 
 #include <grpcpp/client_context.h>
 
+#include "aureole/client.h"
 #include "aureole/v1/simulation.grpc.pb.h"
 #include "client/src/replica_decoder.h"
 
@@ -23,7 +24,7 @@ class RegionWatch {
     std::function<void(bool up)> connection;
   };
   // Both are called on the watch's own thread.
-  RegionWatch(std::string endpoint, v1::StreamReplicasRequest request, Events events);
+  RegionWatch(std::string endpoint, Access access, v1::StreamReplicasRequest request, Events events);
   ~RegionWatch();
 
   // Changes the view, the rate or the level of detail.
@@ -36,6 +37,7 @@ class RegionWatch {
   void Read(Stream* stream, const v1::StreamReplicasRequest& request);
 
   const std::string endpoint_;
+  const Access access_;
   const Events events_;
   std::mutex mutex_;
   std::condition_variable ended_changed_;

@@ -143,6 +143,12 @@ struct RayHit {
   Vec3 point, normal;   // m; out of the body
 };
 
+// What a server may want of its clients.
+struct Access {
+  std::string tls_ca;  // PEM, the authority of the servers' certificates; empty: plain text
+  std::string token;   // empty: none. It is sent over TLS, or within this machine, only
+};
+
 struct Counts {
   int64_t frames = 0, bytes = 0;
   int64_t connections = 0, lost_connections = 0;
@@ -151,8 +157,10 @@ struct Counts {
 class Client {
  public:
   // Asks `server` (host:port of any region server) for the world. DEADLINE_EXCEEDED (4) or UNAVAILABLE (14) when it
-  // does not answer in time.
-  static Status Connect(const std::string& server, std::unique_ptr<Client>* client, double timeout_seconds = 5);
+  // does not answer in time; UNAUTHENTICATED (16) or PERMISSION_DENIED (7) when it wants another token. `access` holds
+  // for all servers of the world.
+  static Status Connect(const std::string& server, std::unique_ptr<Client>* client, double timeout_seconds = 5,
+                        const Access& access = {});
   // Ends all streams. Inputs that were not flushed may or may not act.
   ~Client();
 
