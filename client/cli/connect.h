@@ -11,8 +11,13 @@
 
 namespace aureole {
 
-// Adds --server HOST:PORT, required.
+// Adds --server HOST:PORT, required, and what AddAccess adds.
 void AddServer(CLI::App* command, std::string* server);
+// Adds --tls-ca FILE and --token-file FILE; the environment's AUREOLE_TLS_CA (a file) and AUREOLE_TOKEN (the token)
+// stand for them.
+void AddAccess(CLI::App* command);
+// What they, or the environment, have given to the command that runs.
+client::Access GivenAccess();
 // Adds an option of three numbers, x,y,z.
 CLI::Option* AddVector(CLI::App* command, const std::string& name, std::vector<double>* out, const std::string& help);
 client::Vec3 VectorOf(const std::vector<double>& xyz);

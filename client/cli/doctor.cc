@@ -17,8 +17,10 @@
 #include <grpcpp/grpcpp.h>
 #include <nlohmann/json.hpp>
 
+#include "client/cli/connect.h"
 #include "client/cli/exit_codes.h"
 #include "client/cli/layout_watch.h"
+#include "client/src/channel.h"
 
 namespace aureole {
 namespace {
@@ -167,7 +169,7 @@ class Doctor {
   // Whether clients reach it, how far it is, and whether it is of the same run.
   void Server(const v1::GetWorldResponse& world, int r) {
     const std::string& endpoint = world.endpoints(r);
-    const auto stub = v1::Simulation::NewStub(grpc::CreateChannel(endpoint, grpc::InsecureChannelCredentials()));
+    const auto stub = v1::Simulation::NewStub(client::ChannelTo(endpoint, GivenAccess()));
     double least_ms = 1e9;
     v1::GetWorldResponse answer;
     for (int i = 0; i < 5; ++i) {
@@ -202,6 +204,7 @@ CLI::App* AddDoctor(CLI::App& app, DoctorOptions* o) {
   CLI::App* c = app.add_subcommand("doctor", "Check this machine, and a running world");
   c->add_option("--server", o->server, "Any region server of a world; without it only the machine is checked")
       ->type_name("HOST:PORT");
+  AddAccess(c);
   c->add_flag("--json", o->json, "JSON");
   c->footer(
       std::string("Examples:\n"

@@ -3,6 +3,9 @@
 #include <chrono>
 #include <utility>
 
+#include "client/cli/connect.h"
+#include "client/src/channel.h"
+
 namespace aureole {
 namespace {
 
@@ -14,7 +17,7 @@ std::unique_ptr<LayoutWatch> LayoutWatch::Open(const std::string& server, std::s
   grpc::ClientContext context;
   context.set_deadline(std::chrono::system_clock::now() + std::chrono::seconds(10));
   v1::GetWorldResponse world;
-  const auto stub = v1::Simulation::NewStub(grpc::CreateChannel(server, grpc::InsecureChannelCredentials()));
+  const auto stub = v1::Simulation::NewStub(client::ChannelTo(server, GivenAccess()));
   if (const grpc::Status s = stub->GetWorld(&context, {}, &world); !s.ok()) {
     *error = s.error_message();
     return nullptr;
@@ -46,8 +49,8 @@ RunStatus LayoutWatch::status() const {
 }
 
 void LayoutWatch::Listen(size_t region) {
-  const auto stub = v1::Simulation::NewStub(
-      grpc::CreateChannel(world_.endpoints(static_cast<int>(region)), grpc::InsecureChannelCredentials()));
+  const auto stub =
+      v1::Simulation::NewStub(client::ChannelTo(world_.endpoints(static_cast<int>(region)), GivenAccess()));
   const auto stream = stub->WatchLayout(contexts_[region].get(), {});
   v1::LayoutUpdate update;
   while (stream->Read(&update)) {

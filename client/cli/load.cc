@@ -22,8 +22,10 @@
 #include <nlohmann/json.hpp>
 
 #include "aureole/v1/simulation.grpc.pb.h"
+#include "client/cli/connect.h"
 #include "client/cli/exit_codes.h"
 #include "client/cli/flags.h"
+#include "client/src/channel.h"
 #include "client/src/replica_decoder.h"
 #include "server/control/interrupts.h"
 
@@ -40,7 +42,7 @@ std::shared_ptr<grpc::Channel> Connect(const std::string& endpoint) {
   grpc::ChannelArguments arguments;
   arguments.SetInt(GRPC_ARG_USE_LOCAL_SUBCHANNEL_POOL, 1);
   arguments.SetMaxReceiveMessageSize(-1);
-  return grpc::CreateCustomChannel(endpoint, grpc::InsecureChannelCredentials(), arguments);
+  return client::ChannelTo(endpoint, GivenAccess(), std::move(arguments));
 }
 
 // The first field of a frame is its tick.
@@ -256,6 +258,7 @@ CLI::App* AddLoad(CLI::App& app, LoadOptions* o) {
   c->add_option("--server", o->server, "Any region server of the world, as aureole up prints them")
       ->required()
       ->type_name("HOST:PORT");
+  AddAccess(c);
   c->add_option("--clients", o->clients, "Clients, each with connections of its own")
       ->capture_default_str()
       ->check(CLI::Range(1, 100000));

@@ -3,6 +3,7 @@
 #include <string>
 
 #include "client/cli/act.h"
+#include "client/cli/certificates.h"
 #include "client/cli/check.h"
 #include "client/cli/completion.h"
 #include "client/cli/doctor.h"
@@ -12,6 +13,7 @@
 #include "client/cli/record.h"
 #include "client/cli/replay.h"
 #include "client/cli/report.h"
+#include "client/cli/token.h"
 #include "client/cli/top.h"
 #include "client/cli/up.h"
 #include "client/cli/watch.h"
@@ -48,6 +50,8 @@ int main(int argc, char** argv) {
   aureole::TopOptions top_options;
   aureole::DoctorOptions doctor_options;
   aureole::CompletionOptions completion_options;
+  aureole::CertificatesOptions certificates_options;
+  aureole::TokenOptions token_options;
   const CLI::App* up = aureole::AddUp(app, &up_options);
   const CLI::App* experiment = aureole::AddExperiment(app, &experiment_options);
   const CLI::App* watch = aureole::AddWatch(app, &watch_options);
@@ -61,6 +65,8 @@ int main(int argc, char** argv) {
   const CLI::App* report = aureole::AddReport(app, &report_options);
   const CLI::App* load = aureole::AddLoad(app, &load_options);
   const CLI::App* doctor = aureole::AddDoctor(app, &doctor_options);
+  const CLI::App* certificates = aureole::AddCertificates(app, &certificates_options);
+  const CLI::App* token = aureole::AddToken(app, &token_options);
   const CLI::App* completion = aureole::AddCompletion(app, &completion_options);
   aureole::AddCheck(app, &check_options);
   try {
@@ -78,6 +84,8 @@ int main(int argc, char** argv) {
   if (top->parsed()) return aureole::RunTop(top_options);
   if (doctor->parsed()) return aureole::RunDoctor(doctor_options);
   if (completion->parsed()) return aureole::RunCompletion(app, completion_options);
+  if (certificates->parsed()) return aureole::RunCertificates(certificates_options);
+  if (token->parsed()) return aureole::RunToken(token_options);
   if (record->parsed()) return aureole::RunRecord(record_options);
   if (replay->parsed()) return aureole::RunReplay(replay_options);
   if (report->parsed()) return aureole::RunReport(report_options);

@@ -23,6 +23,7 @@
 #include "client/cli/flags.h"
 #include "client/cli/mcap_writer.h"
 #include "client/cli/recording.h"
+#include "client/src/channel.h"
 #include "server/control/interrupts.h"
 #include "server/replay/replay.h"
 
@@ -37,7 +38,7 @@ constexpr int kTries = 6;  // to name a tick that is to come everywhere
 std::shared_ptr<grpc::Channel> Connect(const std::string& endpoint) {
   grpc::ChannelArguments arguments;
   arguments.SetMaxReceiveMessageSize(-1);
-  return grpc::CreateCustomChannel(endpoint, grpc::InsecureChannelCredentials(), arguments);
+  return client::ChannelTo(endpoint, GivenAccess(), std::move(arguments));
 }
 
 grpc::Status AskWorld(const std::shared_ptr<grpc::Channel>& channel, bool scene, v1::GetWorldResponse* world) {

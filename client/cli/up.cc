@@ -185,6 +185,11 @@ CLI::App* AddUp(CLI::App& app, UpOptions* o) {
       ->type_name("SECONDS");
   up->add_option("--region-server", o->region_server, "Program to start; aureole-region beside this one when not given")
       ->type_name("FILE");
+  up->add_option("--tls", o->tls,
+                 "Directory with ca.crt, tls.crt and tls.key (aureole certificates): TLS; plain text when not given")
+      ->type_name("DIR");
+  up->add_option("--tokens", o->tokens, "File of the tokens that clients need (aureole token); none when not given")
+      ->type_name("FILE");
   up->add_option("--viewer", o->viewer,
                  "Directory of the browser viewer (client/viewer): serves it, and prints its address")
       ->type_name("DIR");
@@ -198,6 +203,10 @@ CLI::App* AddUp(CLI::App& app, UpOptions* o) {
 }
 
 int Up(const UpOptions& options) {
+  if (!options.viewer.empty() && !(options.tls.empty() && options.tokens.empty())) {
+    std::cerr << "--viewer: knows neither TLS nor tokens; leave it out, or --tls and --tokens\n";
+    return kExitBadInput;
+  }
   const absl::StatusOr<WorldFile> file = OpenWorldFile(options.world);
   if (!file.ok()) {
     std::cerr << file.status().message() << '\n';
@@ -216,7 +225,9 @@ int Up(const UpOptions& options) {
 
   run.checkpoint_every = TicksIn(options.checkpoint_s, heading.tick_us);
 
-  LocalAllocator allocator({options.region_server, options.logs, options.verbose, options.data});
+  run.security.tls = options.tls;
+  run.security.tokens = options.tokens;
+  LocalAllocator allocator({options.region_server, options.logs, options.verbose, options.data, FlagsOf(run.security)});
   Display display(heading, options.json, options.viewer);
   RunResult result;
   const absl::Status status = RunWorld(

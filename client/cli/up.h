@@ -17,6 +17,7 @@ struct UpOptions {
   int64_t hash_every = -1;  // ticks; -1: 100 when there is a duration, else none
   std::string logs, data, region_server;
   double checkpoint_s = 1;  // 0: none
+  std::string tls, tokens;  // as aureole-region --help has them; empty: none
   std::string viewer;       // directory of the browser viewer; empty: none
 };
 

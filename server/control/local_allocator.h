@@ -25,6 +25,8 @@ class LocalAllocator final : public Allocator {
     bool verbose = false;
     // Where servers keep checkpoints, a directory for each region; made when missing and kept. Empty: beside the logs.
     std::filesystem::path data_directory = {};
+    // Further flags of every server, such as --tls DIR.
+    std::vector<std::string> flags = {};
   };
   explicit LocalAllocator(Options options);
   ~LocalAllocator() override;

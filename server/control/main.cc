@@ -41,6 +41,11 @@ int main(int argc, char** argv) {
   app.add_option("--checkpoint-every", checkpoint_s, "Seconds of simulated time between checkpoints; 0 for none")
       ->check(CLI::Range(0.0, 3600.0))
       ->capture_default_str();
+  app.add_option("--tls", options.security.tls,
+                 "Directory with ca.crt, tls.crt and tls.key, for this and the servers; plain text when not given");
+  app.add_option("--tokens", options.security.tokens, "File of the tokens that clients need; none when not given");
+  app.add_flag("--insecure", options.security.insecure,
+               "Allow plain text, and clients without tokens, beyond this machine");
   try {
     app.parse(argc, argv);
   } catch (const CLI::ParseError& e) {
@@ -65,6 +70,8 @@ int main(int argc, char** argv) {
   options.checkpoint_every = aureole::TicksIn(checkpoint_s, tick_us);
 
   servers.verbose = true;
+  servers.flags = aureole::FlagsOf(options.security);
+  options.security.log = [](const std::string& what) { std::cerr << "[control] " << what << '\n'; };
   aureole::LocalAllocator allocator(servers);
   aureole::RunResult result;
   aureole::Stage stage = aureole::Stage::kFinished;

@@ -89,13 +89,17 @@ class Runner {
     tokens_ = plan.tokens;
     servers_.resize(static_cast<size_t>(regions));
 
+    absl::StatusOr<std::unique_ptr<Security>> security = Security::Open(options_.security);
+    if (!security.ok()) return security.status();
+    security_ = *std::move(security);
+    if (absl::Status s = security_->CheckListen(options_.listen, false); !s.ok()) return s;
     grpc::EnableDefaultHealthCheckService(true);
     grpc::reflection::InitProtoReflectionServerBuilderPlugin();
     grpc::ServerBuilder builder;
     int port = 0;
     builder.AddChannelArgument(GRPC_ARG_ALLOW_REUSEPORT, 0);  // else a second control plane would share the port
-    builder.AddListeningPort(options_.listen, grpc::InsecureServerCredentials(), &port);
-    builder.RegisterService(service_.get());
+    security_->Listen(&builder, options_.listen, &port);
+    security_->guard().Register(&builder, v1::Control::service_full_name(), service_.get());
     server_ = builder.BuildAndStart();
     if (server_ == nullptr || port == 0) {
       return absl::UnavailableError(absl::StrCat("cannot listen on ", options_.listen, "; is the port in use?"));
@@ -224,6 +228,7 @@ class Runner {
   const RunOptions& options_;
   Allocator& allocator_;
   const EventObserver& on_event_;
+  std::unique_ptr<Security> security_;
   std::unique_ptr<ControlService> service_;
   std::unique_ptr<grpc::Server> server_;  // ends before the service
   std::string address_;

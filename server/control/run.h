@@ -12,6 +12,7 @@
 #include "server/control/allocator.h"
 #include "server/control/control_service.h"
 #include "server/control/run_status.h"
+#include "server/transport/security.h"
 
 namespace aureole {
 
@@ -26,6 +27,7 @@ struct RunOptions {
   // bit; 0: the run ends with the first server that does.
   Tick checkpoint_every = 0;
   std::string listen = "127.0.0.1:0";
+  SecurityOptions security;                // of what listens here; the servers are started with theirs
   std::chrono::seconds join_timeout{120};  // from the start of the servers to the last Ready
   std::chrono::seconds stop_timeout{10};   // from Stop to the end of the last server, which is then killed
 };
@@ -48,7 +50,8 @@ using RunObserver = std::function<bool(const RunStatus&)>;
 // it returns; a second interrupt (interrupts.h) makes short work of servers that take their time. `result` holds what
 // was reported until then. Cancelled: the observer ended it. Aborted: a server ended or left before its time and could
 // not be replaced; the message names the region, how it ended and the tail of its log. DeadlineExceeded: the servers
-// did not join, or did not end, in time. Unavailable: the control plane's port cannot be opened.
+// did not join, or did not end, in time. Unavailable: the control plane's port cannot be opened; or
+// what Security says: it must not be.
 absl::Status RunWorld(const RunOptions& options, Allocator& allocator, const RunObserver& observe, RunResult* result,
                       const EventObserver& on_event = nullptr);
 

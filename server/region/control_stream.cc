@@ -5,7 +5,8 @@
 #include <utility>
 
 #include <grpcpp/create_channel.h>
-#include <grpcpp/security/credentials.h>
+
+#include "server/transport/server_certificate.h"
 
 namespace aureole {
 
@@ -25,11 +26,14 @@ Event EventQueue::Pop() {
   return event;
 }
 
-ControlStream::ControlStream(const std::string& address, v1::Hello hello, EventQueue* events) : events_(events) {
+ControlStream::ControlStream(const std::string& address, const std::shared_ptr<grpc::ChannelCredentials>& credentials,
+                             v1::Hello hello, EventQueue* events)
+    : events_(events) {
   grpc::ChannelArguments arguments;
   arguments.SetInt(GRPC_ARG_ENABLE_HTTP_PROXY, 0);
+  arguments.SetSslTargetNameOverride(kServerName);
   arguments.SetMaxReceiveMessageSize(limits::kMaxWorldFileBytes);  // an assignment holds the whole world
-  stub_ = v1::Control::NewStub(grpc::CreateCustomChannel(address, grpc::InsecureChannelCredentials(), arguments));
+  stub_ = v1::Control::NewStub(grpc::CreateCustomChannel(address, credentials, arguments));
   stub_->async()->Join(&context_, this);
   AddHold();  // writes come from outside of gRPC's callbacks; released when nothing is read any more
   StartRead(&in_);

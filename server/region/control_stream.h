@@ -9,6 +9,7 @@
 #include <string>
 
 #include <grpcpp/client_context.h>
+#include <grpcpp/security/credentials.h>
 
 #include "aureole/v1/control.grpc.pb.h"
 
@@ -39,7 +40,8 @@ class EventQueue {
 class ControlStream final : public grpc::ClientBidiReactor<v1::FromRegion, v1::ToRegion> {
  public:
   // Starts to connect and says `hello`.
-  ControlStream(const std::string& address, v1::Hello hello, EventQueue* events);
+  ControlStream(const std::string& address, const std::shared_ptr<grpc::ChannelCredentials>& credentials,
+                v1::Hello hello, EventQueue* events);
   // Cancels what is left and waits for the end.
   ~ControlStream() override;
 

@@ -107,8 +107,8 @@ void HostedRegion::PeerMoved(const v1::PeerMoved& moved) {
 
 HostedRegion::~HostedRegion() { Stop(); }
 
-void HostedRegion::Connect(PeerService* service) {
-  links_->Connect(service, {assignment_.endpoints().begin(), assignment_.endpoints().end()});
+void HostedRegion::Connect(PeerService* service, const std::shared_ptr<grpc::ChannelCredentials>& credentials) {
+  links_->Connect(service, {assignment_.endpoints().begin(), assignment_.endpoints().end()}, credentials);
 }
 
 void HostedRegion::Start(int64_t start_unix_us, TickLoop::Hooks hooks) {

@@ -33,7 +33,7 @@ class HostedRegion {
   const v1::Assignment& assignment() const { return assignment_; }
 
   // Accepts and dials the peers.
-  void Connect(PeerService* service);
+  void Connect(PeerService* service, const std::shared_ptr<grpc::ChannelCredentials>& credentials);
   // Starts the tick thread. Once.
   void Start(int64_t start_unix_us, TickLoop::Hooks hooks);
   // The peer's next incarnation is there.

@@ -27,6 +27,12 @@ int main(int argc, char** argv) {
   app.add_option("--listen", options.listen, "host:port for peers and clients; port 0 is any")->capture_default_str();
   app.add_option("--metrics", options.metrics, "host:port of Prometheus /metrics, or off")->capture_default_str();
   app.add_option("--data", options.data, "directory for checkpoints, of this region alone; made when missing");
+  app.add_option("--tls", options.security.tls,
+                 "directory with ca.crt, tls.crt and tls.key, read again when they change; plain text when not given");
+  app.add_option("--tokens", options.security.tokens,
+                 "file of the tokens that clients need, read again when it changes; none when not given");
+  app.add_flag("--insecure", options.security.insecure,
+               "allow plain text, and clients without tokens, beyond this machine");
   app.add_option("--log-level", log_level, "on standard error")
       ->check(CLI::IsMember({"debug", "info", "warn", "error", "off"}))
       ->capture_default_str();
@@ -39,7 +45,9 @@ int main(int argc, char** argv) {
     return app.exit(e) == 0 ? 0 : 2;
   }
   if (!health_check.empty()) {
-    const absl::Status s = aureole::CheckHealth(health_check);
+    const auto security = aureole::Security::Open(options.security);
+    const absl::Status s =
+        security.ok() ? aureole::CheckHealth(health_check, (*security)->channel()) : security.status();
     std::cerr << (s.ok() ? "serving" : std::string(s.message())) << "\n";
     return s.ok() ? 0 : 1;
   }

@@ -26,7 +26,8 @@ RegionLinks::RegionLinks(const LinkIdentity& identity, const std::vector<RegionI
 
 RegionLinks::~RegionLinks() { Close(); }
 
-void RegionLinks::Connect(PeerService* service, const std::vector<std::string>& endpoints) {
+void RegionLinks::Connect(PeerService* service, const std::vector<std::string>& endpoints,
+                          const std::shared_ptr<grpc::ChannelCredentials>& credentials) {
   service_ = service;
   std::vector<PeerLink*> dialled_by_peer;
   for (const auto& link : links_) {
@@ -34,7 +35,7 @@ void RegionLinks::Connect(PeerService* service, const std::vector<std::string>& 
   }
   service->Serve(identity_, dialled_by_peer);
   for (const auto& link : links_) {
-    if (link->peer() > identity_.self) link->Dial(endpoints.at(link->peer()));
+    if (link->peer() > identity_.self) link->Dial(endpoints.at(link->peer()), credentials);
   }
 }
 

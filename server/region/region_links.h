@@ -32,7 +32,8 @@ class RegionLinks {
 
   // Accepts the lower peers through `service`, which outlives the links, and dials the higher ones at
   // endpoints[region]. Once.
-  void Connect(PeerService* service, const std::vector<std::string>& endpoints);
+  void Connect(PeerService* service, const std::vector<std::string>& endpoints,
+               const std::shared_ptr<grpc::ChannelCredentials>& credentials = grpc::InsecureChannelCredentials());
 
   // See PeerLink.
   void Redirect(RegionId peer, const std::string& endpoint, uint64_t incarnation);

@@ -65,14 +65,15 @@ class SignalThread {
 class GrpcServer {
  public:
   // Null when it cannot listen.
-  static std::unique_ptr<GrpcServer> Listen(const std::string& address, const std::vector<grpc::Service*>& services) {
+  static std::unique_ptr<GrpcServer> Listen(const std::string& address, Security* security,
+                                            const std::vector<std::pair<const char*, grpc::Service*>>& services) {
     grpc::EnableDefaultHealthCheckService(true);
     grpc::reflection::InitProtoReflectionServerBuilderPlugin();
     grpc::ServerBuilder builder;
     ConfigureServer(&builder);
     int port = 0;
-    builder.AddListeningPort(address, grpc::InsecureServerCredentials(), &port);
-    for (grpc::Service* service : services) builder.RegisterService(service);
+    security->Listen(&builder, address, &port);
+    for (const auto& [name, service] : services) security->guard().Register(&builder, name, service);
     std::unique_ptr<grpc::Server> server = builder.BuildAndStart();
     if (server == nullptr || port == 0) return nullptr;
     auto out = std::make_unique<GrpcServer>();
@@ -97,6 +98,7 @@ class GrpcServer {
 
 // Everything that lives for the whole process, in the order in which it must go, last first.
 struct Process {
+  std::unique_ptr<Security> security;
   EventQueue events;
   std::unique_ptr<RegionMetrics> metrics;  // null: off
   PeerService peers;
@@ -142,6 +144,9 @@ absl::Status Process::Handle(const v1::ToRegion& message) {
   if (message.has_assignment()) {
     if (hosted != nullptr) return absl::FailedPreconditionError("a second assignment");
     const v1::Assignment& assignment = message.assignment();
+    for (const std::string& peer : assignment.endpoints()) {
+      if (absl::Status s = security->CheckDial(peer); !s.ok()) return s;
+    }
     absl::StatusOr<std::unique_ptr<HostedRegion>> loaded = HostedRegion::Load(assignment, data);
     if (!loaded.ok()) return loaded.status();
     hosted = *std::move(loaded);
@@ -151,7 +156,8 @@ absl::Status Process::Handle(const v1::ToRegion& message) {
                  hosted->world().environment.tick_us, assignment.layout_epoch(), assignment.last_tick(),
                  assignment.no_real_time() ? "as fast as it can" : "in real time");
     if (metrics != nullptr) metrics->Assigned(hosted->world().name, assignment.region());
-    hosted->Connect(&peers);
+    security->guard().ServeWorld(hosted->world().name);
+    hosted->Connect(&peers, security->channel());
     v1::FromRegion ready;
     ready.mutable_ready()->set_bodies(hosted->region().engine().Counts().bodies);
     ready.mutable_ready()->set_tick(hosted->region().tick());
@@ -164,6 +170,7 @@ absl::Status Process::Handle(const v1::ToRegion& message) {
     server->SetServing(true);
   } else if (message.has_peer_moved()) {
     if (hosted == nullptr) return absl::FailedPreconditionError("a peer has moved before the assignment");
+    if (absl::Status s = security->CheckDial(message.peer_moved().endpoint()); !s.ok()) return s;
     spdlog::info("region {} is incarnation {} now, at {}", message.peer_moved().region(),
                  message.peer_moved().incarnation(), message.peer_moved().endpoint());
     hosted->PeerMoved(message.peer_moved());
@@ -201,6 +208,19 @@ bool HandleEvent(Process* process, const Event& event, int* exit_code, std::stri
   return false;
 }
 
+// With what it listens on and dials checked.
+absl::StatusOr<std::unique_ptr<Security>> OpenSecurity(const RegionServerOptions& options) {
+  SecurityOptions with_log = options.security;
+  with_log.log = [](const std::string& what) { spdlog::warn("{}", what); };
+  absl::StatusOr<std::unique_ptr<Security>> out = Security::Open(with_log);
+  if (!out.ok()) return out;
+  if (absl::Status s = (*out)->CheckListen(options.listen, true); !s.ok()) return s;
+  if (absl::Status s = (*out)->CheckDial(options.control); !s.ok()) {
+    return absl::Status(s.code(), absl::StrCat("--control: ", s.message()));
+  }
+  return out;
+}
+
 }  // namespace
 
 void BlockSignals() {
@@ -211,6 +231,12 @@ void BlockSignals() {
 int RunRegionServer(const RegionServerOptions& options) {
   Process process;
   process.data = options.data;
+  absl::StatusOr<std::unique_ptr<Security>> security = OpenSecurity(options);
+  if (!security.ok()) {
+    spdlog::error("{}", std::string(security.status().message()));
+    return 1;
+  }
+  process.security = *std::move(security);
   const SignalThread signals(&process.events);
   if (options.metrics != "off") {
     absl::StatusOr<std::unique_ptr<RegionMetrics>> metrics = RegionMetrics::Serve(options.metrics);
@@ -220,7 +246,10 @@ int RunRegionServer(const RegionServerOptions& options) {
     }
     process.metrics = *std::move(metrics);
   }
-  process.server = GrpcServer::Listen(options.listen, {&process.peers, &process.simulation, &process.recording});
+  process.server = GrpcServer::Listen(options.listen, process.security.get(),
+                                      {{v1::Peer::service_full_name(), &process.peers},
+                                       {v1::Simulation::service_full_name(), &process.simulation},
+                                       {v1::Recording::service_full_name(), &process.recording}});
   if (process.server == nullptr) {
     spdlog::error("--listen: cannot listen on {}; choose another host:port, or port 0", options.listen);
     return 1;
@@ -233,7 +262,8 @@ int RunRegionServer(const RegionServerOptions& options) {
   hello.set_pid(getpid());
   spdlog::info("aureole-region: pid {}, control {}, peers and clients {}, metrics {}", getpid(), options.control,
                process.server->endpoint(), process.metrics != nullptr ? process.metrics->endpoint() : "off");
-  process.control = std::make_unique<ControlStream>(options.control, hello, &process.events);
+  process.control =
+      std::make_unique<ControlStream>(options.control, process.security->channel(), hello, &process.events);
 
   int exit_code = 0;
   std::string reason;

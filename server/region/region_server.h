@@ -3,6 +3,8 @@
 
 #include <string>
 
+#include "server/transport/security.h"
+
 namespace aureole {
 
 struct RegionServerOptions {
@@ -11,6 +13,7 @@ struct RegionServerOptions {
   std::string listen = "127.0.0.1:0";   // for peers and clients
   std::string metrics = "127.0.0.1:0";  // Prometheus over HTTP; "off"
   std::string data;                     // directory for checkpoints; empty: none
+  SecurityOptions security;             // its log is the server's
 };
 
 // Blocks SIGTERM, SIGINT and SIGUSR1 in the calling thread and all that it starts: RunRegionServer takes them. Call it

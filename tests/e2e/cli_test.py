@@ -370,6 +370,54 @@ class Clients(Cli):
         self.assertIn("--server", err)
 
 
+class Secured(Cli):
+    def test_world_is_open_to_those_who_have_a_token_and_its_authority(self):
+        certificates, tokens, token = self.path / "certificates", self.path / "tokens.json", self.path / "token"
+        code, _, err = self.run_cli("certificates", certificates)
+        self.assertEqual(code, 0, err)
+        for secret in ("ca.key", "tls.key"):
+            self.assertEqual(stat.S_IMODE((certificates / secret).stat().st_mode), 0o600)
+        code, out, err = self.run_cli("token", "anna", "--world", "bridge", "--rights", "watch", "--tokens", tokens)
+        self.assertEqual(code, 0, err)
+        self.assertGreaterEqual(len(out.strip()), 43)  # 256 bits
+        self.assertNotIn(out.strip(), tokens.read_text())
+        token.write_text(out)
+        code, _, err = self.run_cli("token", "bob", "--world", "bridge", "--rights", "fly", "--tokens", tokens)
+        self.assertEqual(code, 2)
+        self.assertIn("'fly' is no right", err)
+        up = self.start("up", WORLDS / "bridge.json", "--tls", certificates, "--tokens", tokens)
+        line = ""
+        while not line.startswith("servers: "):
+            line = up.stdout.readline()
+            self.assertTrue(line, "the run ended")
+        threading.Thread(target=up.stdout.read, daemon=True).start()
+        server = ("--server", line.split()[1])
+        tls = ("--tls-ca", certificates / "ca.crt")
+        code, out, err = self.run_cli("watch", *server, *tls, "--token-file", token, "--bodies", "--json")
+        self.assertEqual(code, 0, err)
+        self.assertTrue(json.loads(out)["bodies"])
+        code, _, err = self.run_cli("spawn", *server, *tls, "--token-file", token, "--shape", "sphere:1", "--position", "0,9,0")
+        self.assertEqual(code, 1)
+        self.assertIn("NO_RIGHT", err)
+        code, _, err = self.run_cli("watch", *server, *tls)
+        self.assertEqual(code, 2)
+        self.assertIn("NO_TOKEN", err)
+        code, _, err = self.run_cli("watch", *server, "--token-file", token)
+        self.assertEqual(code, 2)
+        self.assertIn("--tls-ca", err)
+        up.send_signal(signal.SIGINT)
+        self.assertEqual(up.wait(DEADLINE_S), 0)
+
+    def test_servers_do_not_listen_in_plain_text_beyond_this_machine(self):
+        commands = (["aureole-region", "--control", "127.0.0.1:1", "--listen", "0.0.0.0:0"],
+                    ["aureole-control", WORLDS / "bridge.json", "--listen", "0.0.0.0:0"])
+        for name, *flags in commands:
+            done = subprocess.run([BIN / name, *flags], capture_output=True, text=True, timeout=DEADLINE_S)
+            self.assertEqual(done.returncode, 1, done.stderr)
+            self.assertIn("--listen: 0.0.0.0:0 is not of this machine only", done.stderr)
+            self.assertIn("--insecure", done.stderr)
+
+
 class Results(Cli):
     def test_json_is_all_of_the_output(self):
         code, out, err = self.run_cli("up", WORLDS / "demo.json", "--duration", "10s", "--no-real-time", "--json",
