@@ -127,6 +127,7 @@ absl::Status LocalAllocator::Start(const ServerStart& start) {
                                     (data / absl::StrCat("region-", start.region)).string(),
                                     "--exit-with-parent"};
   words.insert(words.end(), options_.flags.begin(), options_.flags.end());
+  if (!start.listen.empty()) words.insert(words.end(), {"--listen", start.listen});
   std::vector<char*> arguments;
   for (std::string& word : words) arguments.push_back(word.data());
   arguments.push_back(nullptr);

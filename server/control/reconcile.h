@@ -19,7 +19,7 @@ struct RegionObserved {
   bool clean = false;        // not alive: it ended with exit status 0
   double silent_s = 0;       // since it was last heard of, or was started
   double down_s = 0;         // not alive: since it ended
-  int failures = 0;          // servers in a row that ended before they had lived for kStableSeconds
+  int failures = 0;          // servers in a row that ended without getting the region further than it was before
   std::string how;           // not alive: how it ended
 };
 
@@ -44,11 +44,9 @@ struct Action {
 // A server whose stream has ended, or that says nothing for so long, is replaced. Far above what a server that is
 // stopped for a moment, or pages, needs.
 inline constexpr double kExitAfterLeaveSeconds = 3, kLeaseSeconds = 6;
-// From Hello on; a server may take longer to start.
-inline constexpr double kStableSeconds = 10;
-// Servers of one region that may end in a row before the run gives up, and the wait before the n-th of them: 0.1 s,
-// doubled each time, at most 10 s.
-inline constexpr int kMostFailures = 8;
+// Servers of one region that may end in a row without getting further before the run gives up (P74), and the wait
+// before the next one after n of them: 0.1 s, doubled each time, at most 10 s.
+inline constexpr int kMostFailures = 6;
 double BackOffSeconds(int failures);
 
 std::vector<Action> Reconcile(const Observed& observed);

@@ -70,9 +70,10 @@ class Runner {
   struct Server {
     uint64_t incarnation = 0;
     bool alive = false;
-    Clock::time_point started, ended;
-    int failures = 0;  // in a row
-    ServerExit exit;   // when it is not alive
+    Clock::time_point ended;
+    Tick furthest = 0;  // that any server of it had reported when it ended
+    int failures = 0;   // in a row, without getting further
+    ServerExit exit;    // when it is not alive
   };
 
   absl::Status Serve() {
@@ -135,13 +136,18 @@ class Runner {
   }
 
   void TakeExits() {
-    for (ServerExit& exit : allocator_.Poll()) {
+    const std::vector<ServerExit> exits = allocator_.Poll();
+    if (exits.empty()) return;
+    const RunStatus status = service_->Status();
+    for (const ServerExit& exit : exits) {
       Server& server = servers_[static_cast<size_t>(exit.region)];
       if (exit.incarnation != server.incarnation) continue;
       server.alive = false;
       server.ended = Clock::now();
-      server.failures = Seconds(server.ended - server.started) < kStableSeconds ? server.failures + 1 : 0;
-      server.exit = std::move(exit);
+      const Tick tick = status.regions[static_cast<size_t>(exit.region)].report.tick();
+      server.failures = tick > server.furthest ? 0 : server.failures + 1;
+      server.furthest = std::max(server.furthest, tick);
+      server.exit = exit;
     }
   }
 
@@ -189,17 +195,18 @@ class Runner {
   }
 
   absl::Status Start(const Action& a) {
-    std::string token = tokens_[static_cast<size_t>(a.region)];
+    Server& server = servers_[static_cast<size_t>(a.region)];
+    std::string token = tokens_[static_cast<size_t>(a.region)], listen;
     if (a.incarnation > 1) {
       token = MakeToken();
       service_->Expect(a.region, a.incarnation, token);
+      // Once: another program may have taken the port.
+      if (server.failures == 0) listen = service_->Status().regions[static_cast<size_t>(a.region)].endpoint;
       Tell(a.region, absl::StrCat("incarnation ", a.incarnation, " is started: ", a.why));
     }
-    if (absl::Status s = allocator_.Start({a.region, a.incarnation, token, address_}); !s.ok()) return s;
-    Server& server = servers_[static_cast<size_t>(a.region)];
+    if (absl::Status s = allocator_.Start({a.region, a.incarnation, token, address_, listen}); !s.ok()) return s;
     server.incarnation = a.incarnation;
     server.alive = true;
-    server.started = Clock::now();
     server.exit = {};
     return absl::OkStatus();
   }

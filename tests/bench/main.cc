@@ -7,6 +7,7 @@
 #include "tests/bench/client_bytes.h"
 #include "tests/bench/fan_out.h"
 #include "tests/bench/overhead.h"
+#include "tests/bench/recovery.h"
 #include "tests/bench/stopped_clients.h"
 #include "tests/bench/view_cost.h"
 
@@ -86,6 +87,22 @@ void PrintViewCost(const ViewCostOptions& options, bool json) {
               r.distinct_us);
 }
 
+int PrintRecovery(const RecoveryOptions& options, bool json) {
+  const RecoveryResult r = MeasureRecovery(options);
+  std::printf(
+      json ? "{\"killed\": %d, \"ticks\": %" PRId64 ", \"bodies\": %" PRId64
+             ", \"hashes\": %d, \"equal\": %d, \"longest_stop_s\": %.3f, \"lost_s\": %.3f, \"checkpoints\": "
+             "%" PRId64 ", \"checkpoint_kb\": %.1f, \"write_ms\": %.2f, \"pause_ms\": %.3f}\n"
+           : "%d servers killed in %" PRId64 " ticks, %" PRId64
+             " bodies\nhashes: %d, equal to the undivided world's: %d\nlongest stop of the world: %.2f s; behind "
+             "the wall clock at the end: %.2f s\n%" PRId64
+             " checkpoints, at most %.0f kB, written in %.1f ms; the tick paused for at most %.2f ms\n",
+      r.killed, r.ticks, r.bodies, r.hashes, r.equal, r.longest_stop_s, r.lost_s, r.checkpoints, r.checkpoint_kb,
+      r.write_ms, r.pause_ms);
+  if (!r.ok) std::fprintf(stderr, "%s\n", r.message.empty() ? "the hashes differ" : r.message.c_str());
+  return r.ok ? 0 : 1;
+}
+
 int Run(int argc, char** argv) {
   CLI::App app("Benchmarks of Aureole.");
   app.require_subcommand(1);
@@ -120,7 +137,18 @@ int Run(int argc, char** argv) {
   view->add_flag("--json", json, "One JSON object instead of text");
   view->add_option("--bodies", view_options.bodies, "Bodies of the large world")->check(CLI::Range(2000, 1000000));
   view->add_option("--frames", view_options.frames, "Measured frames")->check(CLI::Range(4, 100000));
+  RecoveryOptions recovery_options;
+  CLI::App* recovery = app.add_subcommand("recovery", "Servers killed at random moments, on real processes.");
+  recovery->add_flag("--json", json, "One JSON object instead of text");
+  recovery->add_option("--world", recovery_options.world, "World file")->check(CLI::ExistingFile);
+  recovery->add_option("--kills", recovery_options.kills, "SIGKILLs")->check(CLI::Range(1, 100000));
+  recovery->add_option("--every", recovery_options.every_ms, "Milliseconds between them, on average")
+      ->check(CLI::Range(50, 100000));
+  recovery->add_option("--seed", recovery_options.seed, "Of the moments and the servers");
+  recovery->add_option("--checkpoint-every", recovery_options.checkpoint_s, "Seconds between checkpoints")
+      ->check(CLI::Range(0.016, 3600.0));
   CLI11_PARSE(app, argc, argv);
+  if (recovery->parsed()) return PrintRecovery(recovery_options, json);
   if (overhead->parsed()) PrintOverhead(overhead_options, json);
   if (bytes->parsed()) PrintClientBytes(bytes_options, json);
   if (view->parsed()) PrintViewCost(view_options, json);

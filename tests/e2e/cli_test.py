@@ -131,8 +131,21 @@ class Processes(Cli):
         process.kill()
         self.assert_gone(servers)
 
-    def test_killed_server_fails_the_run_by_name(self):
-        process = self.start("up", WORLDS / "demo.json", *self.fake())
+    def test_killed_server_is_replaced_and_the_run_goes_on(self):
+        process = self.start("up", WORLDS / "demo.json", "--duration", "6s", "--data", self.path / "data", "--json")
+        servers = self.servers_of(process, 4)
+        wait_for(lambda: (self.path / "data/region-2/checkpoint").exists(), "a checkpoint")
+        time.sleep(1.5)  # it ticks
+        os.kill(servers[2], signal.SIGKILL)
+        out, err = process.communicate(timeout=DEADLINE_S)
+        self.assertEqual(process.returncode, 0, err)
+        self.assertIn("region 2: incarnation 2 is started: killed by signal 9 (Killed)", err)
+        whole = self.run_cli("up", WORLDS / "demo.json", "--duration", "6s", "--undivided", "--no-real-time", "--json")
+        self.assertEqual(json.loads(out)["hashes"], json.loads(whole[1])["hashes"])
+        self.assert_gone(servers)
+
+    def test_killed_server_without_checkpoints_fails_the_run_by_name(self):
+        process = self.start("up", WORLDS / "demo.json", "--checkpoint-every", "0", *self.fake())
         servers = self.servers_of(process, 4)
         wait_for(lambda: "tick" in process.stdout.readline(), "a tick")
         os.kill(servers[2], signal.SIGKILL)

@@ -237,7 +237,7 @@ class ServiceTest : public Test {
 TEST_F(ServiceTest, StrangeTokenIsRefused) {
   const grpc::Status s = Say({Hello("c")});
   EXPECT_EQ(s.error_code(), grpc::StatusCode::UNAUTHENTICATED);
-  EXPECT_EQ(s.error_message(), "hello.token: is not one of this run");
+  EXPECT_EQ(s.error_message(), "hello.token: is not one of this run, or of a server that has been replaced");
   EXPECT_FALSE(service_.Status().regions[0].joined);
 }
 

@@ -5,12 +5,14 @@
 
 int main(int argc, char** argv) {
   CLI::App app;
-  std::string control, token;
+  std::string control, token, data, listen;
   aureole::FakeBehaviour behaviour;
   bool with_parent = false;
   app.add_option("--control", control)->required();
   app.add_option("--token", token)->required();
   app.add_flag("--exit-with-parent", with_parent);
+  app.add_option("--data", data);
+  app.add_option("--listen", listen);
   app.add_option("--die-at", behaviour.die_at);
   app.add_option("--fail-region", behaviour.fail_region);
   app.add_option("--lose-at", behaviour.lose_at);

@@ -113,7 +113,7 @@ class Cluster {
         }
       };
       hooks.log = [](const std::string& what) { ADD_FAILURE() << what; };
-      node->loop = std::make_unique<TickLoop>(world_, node->region.get(), node->links.get(), options, hooks);
+      node->loop = std::make_unique<TickLoop>(world_, node->region.get(), node->links.get(), nullptr, options, hooks);
       node->thread = std::thread([loop = node->loop.get()] { EXPECT_TRUE(loop->Run()); });
     }
     std::mt19937_64 random(5);
