@@ -11,7 +11,8 @@
 namespace aureole {
 
 struct Allgather {
-  Allgather(int regions, RegionId self);
+  // `members`, ascending, are those that take part; `self` is one of them.
+  Allgather(const std::vector<RegionId>& members, RegionId self);
 
   std::vector<RegionId> row;      // the others of the own row: first hop, both ways; ascending
   std::vector<RegionId> targets;  // second hop: who gets the row from this region; ascending

@@ -60,9 +60,17 @@ void Visit(Archive& a, Area& v) {
   a(v.centre, v.radius, v.outward, v.fades);
 }
 template <class Archive>
+void Visit(Archive& a, Rect& v) {
+  a(v.min_x, v.max_x, v.min_z, v.max_z);
+}
+template <class Archive>
+void Visit(Archive& a, LayoutChange& v) {
+  a(v.epoch, v.regions, v.ranks, v.members);
+}
+template <class Archive>
 void Visit(Archive& a, Input& v) {
   a(v.tick, v.source, v.sequence, v.kind, v.body, v.area, v.linear, v.angular, v.frame, v.point, v.ticks, v.again,
-    v.spawn);
+    v.spawn, v.layout);
 }
 
 namespace archive_internal {

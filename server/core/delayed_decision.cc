@@ -103,7 +103,7 @@ void DelayedExchange::Push(const std::vector<Node>& nodes, const std::vector<int
   std::vector<BodyId> ids;
   for (int i : members) {
     owners.insert(nodes[i].owner);
-    if (h_.world.layout.rank(nodes[i].owner) < h_.world.layout.rank(best)) best = nodes[i].owner;
+    if (h_.layout().rank(nodes[i].owner) < h_.layout().rank(best)) best = nodes[i].owner;
     if (nodes[i].own) ids.push_back(nodes[i].id);
   }
   if (ids.empty()) return;
@@ -131,9 +131,9 @@ void DelayedExchange::BoundaryTraverse() {
     std::vector<std::pair<RegionId, double>> mass;
     for (BodyId id : island) {
       const BodyView v = OwnView(id);
-      AddMass(&mass, h_.world.layout.Home(v.centre), v.mass);
+      AddMass(&mass, h_.layout().Home(v.centre), v.mass);
     }
-    const RegionId home = Heaviest(h_.world.layout, mass);
+    const RegionId home = Heaviest(h_.layout(), mass);
     if (home != h_.self) Send(std::move(island), home, TransferCause::kBoundaryTraverse);
   }
 }

@@ -188,7 +188,7 @@ void DelayedExchange::AnnounceSpawns() {
   ScriptedInputs(h_.world, h_.tick + margins_.spawn_notice, &inputs);
   h_.live.due().AppendDue(h_.tick + margins_.spawn_notice, &inputs);
   for (Input& i : inputs) {
-    if (i.kind != Input::Kind::kSpawn || h_.world.layout.Home(i.spawn->position) != h_.self) continue;
+    if (i.kind != Input::Kind::kSpawn || h_.layout().Home(i.spawn->position) != h_.self) continue;
     i.body = i.spawn->id;
     h_.pending.insert(std::upper_bound(h_.pending.begin(), h_.pending.end(), i), i);
   }
@@ -221,7 +221,7 @@ void DelayedExchange::Send(std::vector<BodyId> ids, RegionId to, TransferCause c
     s.owner = to;
     s.epoch = h_.held.at(id).epoch + 1;
     s.sent = h_.tick;
-    s.group = (groups_ * h_.world.layout.size()) + h_.self;
+    s.group = (groups_ * h_.layout().size()) + h_.self;
     s.states.push_back(StateOf(*h_.engine, id, OwnView(id)));
     if (auto b = bounds_.find(id); b != bounds_.end()) s.bound = b->second;
     shadows_[id] = std::move(s);

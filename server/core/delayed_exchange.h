@@ -35,7 +35,7 @@ class DelayedExchange final : public Protocol {
 
   void Missing(std::vector<RegionId>* out) const override;
 
-  bool MaySend(RegionId, int round) const override { return round == 0; }
+  bool MaySend(RegionId, int round, const Division::State&) const override { return round == 0; }
 
   void Advance(std::vector<Frame>* out) override;
 

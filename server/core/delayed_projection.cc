@@ -101,9 +101,9 @@ void DelayedExchange::ProjectToRegions(BodyId id, const BodyView& v, RegionId ow
   const Box box = SphereBox(v);
   const double reach = ProjectReach();
   for (RegionId peer : h_.peers) {
-    if (h_.world.layout.rect(peer).Gap(box) <= reach) (*next)[peer].emplace(id, MakeAura(id, v, owner, peer));
+    if (h_.layout().rect(peer).Gap(box) <= reach) (*next)[peer].emplace(id, MakeAura(id, v, owner, peer));
   }
-  if (!h_.world.layout.rect(owner).Encloses(box, 0)) (*away)[id] = {id, owner, RoundOutward(box)};
+  if (!h_.layout().rect(owner).Encloses(box, 0)) (*away)[id] = {id, owner, RoundOutward(box)};
 }
 
 }  // namespace aureole

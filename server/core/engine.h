@@ -24,22 +24,6 @@
 
 namespace aureole {
 
-// Half-open rectangle in x and z; y is unbounded; outer edges may be infinite.
-struct Rect {
-  double min_x = 0, max_x = 0, min_z = 0, max_z = 0;
-
-  bool Contains(double x, double z) const { return x >= min_x && x < max_x && z >= min_z && z < max_z; }
-  // Whether the box lies wholly in the closed rectangle shrunk by `margin` on each finite side.
-  bool Encloses(const Box& b, double margin) const {
-    return b.min.x() >= min_x + margin && b.max.x() <= max_x - margin && b.min.z() >= min_z + margin &&
-           b.max.z() <= max_z - margin;
-  }
-  // Chebyshev distance in x, z from the box to the closed rectangle; zero or less iff they meet.
-  double Gap(const Box& b) const {
-    return std::max(std::max(min_x - b.max.x(), b.min.x() - max_x), std::max(min_z - b.max.z(), b.min.z() - max_z));
-  }
-};
-
 // What the protocol knows of one body.
 struct BodyView {
   BodyId id = 0;

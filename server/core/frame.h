@@ -104,14 +104,16 @@ struct Graph {
   // Inputs of clients offered to `of`, in the order in which they came; and those that `of` has applied.
   std::vector<Input> inputs;
   std::vector<AppliedInput> applied;
+  // `of` has no area and no body left; said once, and true from then on.
+  bool emptied = false;
   bool empty() const {
     return edges.empty() && fragments.empty() && late.empty() && opened.empty() && closed.empty() && inputs.empty() &&
-           applied.empty();
+           applied.empty() && !emptied;
   }
 
   template <class Archive>
   void Visit(Archive& a) {
-    a(of, edges, fragments, late, opened, closed, inputs, applied);
+    a(of, edges, fragments, late, opened, closed, inputs, applied, emptied);
   }
 };
 
@@ -151,6 +153,8 @@ enum Round : int {
   kGraphsAgain = 3,
   kGraphsAgainOn = 4,
   kTransfers = 5,
+  // After tick n, to the regions that join in tick n + 1: what all others know alike (division.h, live_inputs.h).
+  kWelcome = 6,
 };
 
 struct Frame {
@@ -162,6 +166,7 @@ struct Frame {
   std::vector<BodyId> gone;
   std::vector<Graph> graphs;  // those that are not empty; ascending by `of`
   std::vector<Transfer> transfers;
+  std::string welcome;  // of that round; as archive.h writes it
   // k >= 1, as changes: boxes of the bodies that the sender projects and that are not wholly inside their owner's
   // region (PROTOCOL.md section 3c).
   std::vector<Away> away;

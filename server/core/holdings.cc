@@ -61,9 +61,10 @@ absl::Status ValidateGraph(const Graph& g) {
 // Every round of the synchronous exchange says one kind of thing.
 absl::Status ValidateRound(const Frame& f) {
   const bool boxes = f.round == kBoxes, transfers = f.round == kTransfers;
-  if (f.round < kBoxes || f.round > kTransfers) return Malformed("round", "no such round");
+  if (f.round < kBoxes || f.round > kWelcome) return Malformed("round", "no such round");
+  if ((f.round == kWelcome) == f.welcome.empty()) return Malformed("welcome", "in its round, and only there");
   if (!boxes && !(f.auras.empty() && f.gone.empty())) return Malformed("auras", "not in this round");
-  if ((boxes || transfers) && !f.graphs.empty()) return Malformed("graphs", "not in this round");
+  if ((boxes || transfers || f.round == kWelcome) && !f.graphs.empty()) return Malformed("graphs", "not in this round");
   if (transfers == f.transfers.empty()) return Malformed("transfers", "in the last round, and only there");
   if (!f.away.empty() || !f.away_gone.empty()) return Malformed("away", "not in a synchronous exchange");
   return absl::OkStatus();
@@ -104,6 +105,7 @@ absl::Status Inbox::Accept(Frame frame, Tick now, bool synchronous) {
     if (absl::Status s = ValidateRound(frame); !s.ok()) return s;
     follows = frame.tick > 0 && (frame.tick != tick_ ? frame.tick > tick_ : frame.round > round_);
   } else {
+    if (!frame.welcome.empty()) return Malformed("welcome", "not with a delay");
     follows = frame.round == 0 && frame.tick == tick_ + 1;
   }
   if (!follows) {
@@ -125,12 +127,32 @@ Frame Inbox::Pop() {
   return f;
 }
 
-Holdings::Holdings(const World& w, RegionId s, std::unique_ptr<Engine> e)
-    : world(w), self(s), rect(w.layout.rect(s)), engine(std::move(e)) {
-  for (RegionId r = 0; r < w.layout.size(); ++r) {
+Holdings::Holdings(const World& w, RegionId s, std::unique_ptr<Engine> e, Division d)
+    : world(w),
+      self(s),
+      engine(std::move(e)),
+      division(std::move(d)),
+      live({}, w.exchange.k == 0 ? &division : nullptr) {
+  FollowDivision();
+}
+
+void Holdings::FollowDivision() {
+  rect = self < layout().size() ? layout().rect(self) : Rect{};
+  peers.clear();
+  for (RegionId r : division.now().members) {
     if (r == self) continue;
     peers.push_back(r);
     inboxes[r];
+  }
+  for (auto it = inboxes.begin(); it != inboxes.end();) {
+    auto& [peer, inbox] = *it;
+    const bool member = std::binary_search(peers.begin(), peers.end(), peer);
+    if (!member) inbox.Renew();
+    if (!member && inbox.Front() == nullptr) {
+      inboxes.erase(it++);
+    } else {
+      ++it;
+    }
   }
 }
 
@@ -260,7 +282,7 @@ void Holdings::CountHomes(std::span<const BodyId> near) {
   auto before = homes_.begin();
   for (BodyId id : near) {
     if (!engine->Contains(id)) continue;
-    const RegionId home = world.layout.Home(engine->View(id).centre);
+    const RegionId home = layout().Home(engine->View(id).centre);
     while (before != homes_.end() && before->first < id) ++before;
     // Not in the list: it was inside its home, or it has arrived and the sender has counted, or it began where it is.
     if (before != homes_.end() && before->first == id) {
@@ -275,15 +297,41 @@ void Holdings::CountHomes(std::span<const BodyId> near) {
 }
 
 void Holdings::Save(Writer& a) const {
-  a(tick, engine->Save(engine->Ids()), held, inboxes, stats, pending, live, newcomers_, homes_);
+  a(tick, division, engine->Save(engine->Ids()), held, inboxes, stats, pending, live, newcomers_, homes_);
 }
 
 bool Holdings::Load(Reader& a) {
   std::string bodies;
-  a(tick, bodies, held, inboxes, stats, pending, live, newcomers_, homes_);
-  const bool known = inboxes.size() == peers.size() &&
-                     std::all_of(peers.begin(), peers.end(), [this](RegionId p) { return inboxes.contains(p); });
-  return a.ok() && known && engine->Restore(bodies).ok();
+  a(tick, division, bodies, held, inboxes, stats, pending, live, newcomers_, homes_);
+  if (!a.ok() || !division.now().IsMember(self)) return false;
+  FollowDivision();
+  return engine->Restore(bodies).ok();
+}
+
+absl::Status CheckRegions(const Frame& frame, const Division::State& division) {
+  const auto malformed = [](const char* field) {
+    return absl::InvalidArgumentError(absl::StrCat("frame.graphs.", field, ": no such region"));
+  };
+  const auto home = [&division](RegionId r) {
+    return r >= 0 && r < division.layout.size() && division.layout.has_area(r);
+  };
+  for (const Graph& g : frame.graphs) {
+    const auto other = [&](RegionId r) { return r != g.of && division.IsMember(r); };
+    if (!division.IsMember(g.of)) return malformed("of");
+    if (g.emptied && home(g.of)) return absl::InvalidArgumentError("frame.graphs.emptied: the region has an area");
+    for (const Fragment& f : g.fragments) {
+      if (f.gives_back != kNoRegion && !home(f.gives_back)) return malformed("fragments.gives_back");
+      for (const auto& [region, kg] : f.mass_by_home) {
+        if (!home(region)) return malformed("fragments.mass_by_home");
+      }
+    }
+    for (const LateAura& l : g.late) {
+      if (!other(l.to)) return malformed("late.to");
+    }
+    if (!std::all_of(g.opened.begin(), g.opened.end(), other)) return malformed("opened");
+    if (!std::all_of(g.closed.begin(), g.closed.end(), other)) return malformed("closed");
+  }
+  return absl::OkStatus();
 }
 
 RegionId Heaviest(const Layout& layout, std::span<const std::pair<RegionId, double>> mass) {

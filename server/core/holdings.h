@@ -12,6 +12,7 @@
 #include <absl/status/statusor.h>
 
 #include "server/core/archive.h"
+#include "server/core/division.h"
 #include "server/core/engine.h"
 #include "server/core/frame.h"
 #include "server/core/live_inputs.h"
@@ -40,8 +41,14 @@ class Inbox {
   absl::Status Accept(Frame frame, Tick now, bool synchronous);
   const Frame* Front() const { return frames_.empty() ? nullptr : &frames_.front(); }
   Frame Pop();
-  // Frames popped since the beginning of the world.
+  // Frames popped since the peer became a member.
   uint64_t taken() const { return taken_; }
+  // The peer is no member any more. What waits is of a life to come.
+  void Renew() {
+    taken_ = 0;
+    taken_tick_ = -1;
+    taken_round_ = kTransfers;
+  }
 
   // As far as frames were popped: those that wait are not in it, and come again.
   template <class Archive>
@@ -62,14 +69,15 @@ class Inbox {
 };
 
 struct Holdings {
-  Holdings(const World& w, RegionId s, std::unique_ptr<Engine> e);
+  Holdings(const World& w, RegionId s, std::unique_ptr<Engine> e, Division d);
 
   const World& world;
   const RegionId self;
-  const Rect rect;
   std::unique_ptr<Engine> engine;
-  std::vector<RegionId> peers;  // ascending
-  absl::flat_hash_map<RegionId, Inbox> inboxes;
+  Division division;
+  Rect rect;                                     // of self, by the layout in force
+  std::vector<RegionId> peers;                   // the other members, ascending
+  absl::flat_hash_map<RegionId, Inbox> inboxes;  // of all peers, and of others whose frames came early
   absl::flat_hash_map<BodyId, Held> held;
   Tick tick = 0;  // last stepped
   RegionStats stats;
@@ -80,6 +88,9 @@ struct Holdings {
   std::vector<Input> pending;  // k >= 1: announced spawns of owned bodies that have not taken effect, in Input's order
   LiveInputs live;
 
+  const Layout& layout() const { return division.now().layout; }
+  // After now() of the division has changed: the rectangle, the peers and their inboxes.
+  void FollowDivision();
   // Adds bodies and joints of state 0 that this region owns.
   void LoadInitialState(double margin);
   // Every input that takes effect at the start of tick n, of the script and of clients, in Input's order, appended. The
@@ -114,6 +125,9 @@ RegionId Heaviest(const Layout& layout, std::span<const std::pair<RegionId, doub
 // Adds to the entry of `home`, keeping the list ascending.
 void AddMass(std::vector<std::pair<RegionId, double>>* mass, RegionId home, double kg);
 
+// Whether what the frame says of regions fits the division of its tick: InvalidArgument names the field.
+absl::Status CheckRegions(const Frame& frame, const Division::State& division);
+
 // The exchange of a region: synchronous (k = 0) or with a fixed delay (k >= 1). Same meaning as in Region.
 class Protocol {
  public:
@@ -122,8 +136,8 @@ class Protocol {
   virtual bool Ready() const = 0;
   virtual void Missing(std::vector<RegionId>* out) const = 0;
   virtual void Advance(std::vector<Frame>* out) = 0;
-  // Whether a frame of this round can come from that peer.
-  virtual bool MaySend(RegionId peer, int round) const = 0;
+  // Whether a frame of this round can come from that peer in a tick that is divided so.
+  virtual bool MaySend(RegionId peer, int round, const Division::State& division) const = 0;
   // Appends what is in flight from here: stepped by nobody's engine in tick `tick() + 1` (before its step), or in state
   // `tick()`.
   virtual void ObserveInFlight(std::vector<BodyRecord>* out) const = 0;
@@ -134,7 +148,8 @@ class Protocol {
   virtual void Load(Reader& a) = 0;
 };
 
-std::unique_ptr<Protocol> MakeSyncExchange(Holdings& holdings);
+// `joins`: the region joins a world that runs, and begins at Phase::kJoin.
+std::unique_ptr<Protocol> MakeSyncExchange(Holdings& holdings, bool joins);
 std::unique_ptr<Protocol> MakeDelayedExchange(Holdings& holdings);
 
 }  // namespace aureole

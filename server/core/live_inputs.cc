@@ -30,14 +30,25 @@ absl::Status CheckArea(const Input& input) {
   return absl::OkStatus();
 }
 
+absl::Status CheckLayoutChange(const Input& input) {
+  if (input.layout == nullptr) return absl::InvalidArgumentError("input.layout: must be given");
+  const absl::Status s = LayoutOf(*input.layout).status();
+  return s.ok() ? s : absl::InvalidArgumentError(absl::StrCat("input.layout.", std::string(s.message())));
+}
+
 }  // namespace
 
 absl::Status CheckLiveInput(const Input& input) {
   if (input.source == 0) return absl::InvalidArgumentError("input.source: must not be 0");
   if (input.sequence == 0) return absl::InvalidArgumentError("input.sequence: must be at least 1");
-  if (input.kind < Input::Kind::kSpawn || input.kind > Input::Kind::kVelocityChange) {
+  if (input.kind < Input::Kind::kSpawn || input.kind > Input::Kind::kLayout) {
     return absl::InvalidArgumentError("input.kind: no such kind");
   }
+  if ((input.kind == Input::Kind::kLayout) != (input.source == kControlSource)) {
+    return absl::InvalidArgumentError(
+        "input.source: the control plane changes the layout, and nobody and nothing else");
+  }
+  if (input.kind == Input::Kind::kLayout) return CheckLayoutChange(input);
   if (input.kind == Input::Kind::kSpawn) {
     if (input.spawn != nullptr && input.spawn->shape != nullptr) return absl::OkStatus();
     return absl::InvalidArgumentError("input.spawn: must be given, with a shape");
@@ -58,7 +69,8 @@ absl::Status CheckLiveInput(const Input& input) {
 }
 
 size_t BytesOf(const Input& input, const Input* before) {
-  constexpr size_t kPlain = 192, kBody = 320;
+  constexpr size_t kPlain = 192, kBody = 320, kRegion = 48;
+  if (input.layout != nullptr) return kPlain + kRegion * input.layout->regions.size();
   if (input.spawn == nullptr) return kPlain;
   const bool same = before != nullptr && before->spawn != nullptr && before->spawn->shape == input.spawn->shape;
   return kBody + (same ? 0 : BytesOf(*input.spawn->shape));
@@ -100,6 +112,10 @@ void LiveInputs::Deliver(const std::vector<Input>& inputs, Tick effect, Tick spa
       continue;
     }
     source->last = told.sequence;
+    if (told.kind == Input::Kind::kLayout) {
+      ChangeLayout(told, effect, mine);
+      continue;
+    }
     Open& open = open_[{tick, name}];
     open.mine = mine ? 1 : 0;
     open.over_area = told.over_area();
@@ -120,9 +136,27 @@ void LiveInputs::Deliver(const std::vector<Input>& inputs, Tick effect, Tick spa
   }
 }
 
+void LiveInputs::ChangeLayout(const Input& told, Tick effect, bool mine) {
+  const Tick adopted = effect - 1 + kLayoutNotice;
+  const absl::Status s = division_ == nullptr ? absl::FailedPreconditionError("the layout of this world is fixed")
+                                              : division_->Deliver(*told.layout, adopted);
+  const InputName name{told.source, told.sequence};
+  const Tick tick = s.ok() ? adopted : effect;
+  Open& open = open_[{tick, name}];
+  open.mine = mine ? 1 : 0;
+  open.refused = std::string(s.message());
+  effect_[name] = tick;
+}
+
+void LiveInputs::Learn(Reader& a) {
+  VisitCommon(a);
+  for (auto& [key, open] : open_) open.mine = 0;
+}
+
 // Null when there are too many and all have spoken of late.
 LiveInputs::Source* LiveInputs::Find(uint64_t id, Tick effect) {
-  if (!sources_.contains(id) && sources_.size() >= limits_.clients) {
+  if (id == kControlSource) return &sources_[id];
+  if (!sources_.contains(id) && by_silence_.size() >= limits_.clients) {
     const auto [heard, silent] = *by_silence_.begin();
     if (heard + kKeptTicks >= effect) return nullptr;
     sources_.erase(silent);
@@ -178,7 +212,7 @@ void LiveInputs::Heard(const std::vector<AppliedInput>& applied) {
 void LiveInputs::Settle(Tick n) {
   while (!open_.empty() && open_.begin()->first.first <= n) {
     const auto& [key, open] = *open_.begin();
-    const InputOutcome outcome{key.second, key.first, open.bodies, open.spawned, open.full};
+    const InputOutcome outcome{key.second, key.first, open.bodies, open.spawned, open.full, open.refused};
     outcomes_.insert(outcomes_.end(), static_cast<size_t>(open.mine), outcome);
     Keep(outcome);
     effect_.erase(outcome.name);

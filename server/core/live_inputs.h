@@ -11,12 +11,15 @@
 #include <deque>
 #include <map>
 #include <set>
+#include <string>
 #include <utility>
 #include <vector>
 
 #include <absl/container/flat_hash_map.h>
 #include <absl/status/status.h>
 
+#include "server/core/archive.h"
+#include "server/core/division.h"
 #include "server/core/frame.h"
 #include "server/core/input_schedule.h"
 #include "server/core/limits.h"
@@ -31,13 +34,15 @@ struct InputOutcome {
   int64_t bodies = 0;  // on which it acted, in its first tick; 0: what it named was nowhere then
   BodyId body = 0;     // a spawn's
   bool full = false;   // it does not act: the world has as many clients, bodies of clients, or forces as it may
+  // Of a change of the layout: why it has no effect. Empty: it is in force from `tick` on.
+  std::string refused = {};
 
   bool applied() const { return bodies > 0; }
   friend bool operator==(const InputOutcome&, const InputOutcome&) = default;
 
   template <class Archive>
   void Visit(Archive& a) {
-    a(name, tick, bodies, body, full);
+    a(name, tick, bodies, body, full, refused);
   }
 };
 
@@ -47,7 +52,8 @@ inline bool IsLiveId(BodyId id) { return id >= kFirstLiveId && id < 2 * kFirstLi
 // A force lasts at most so long.
 inline constexpr Tick kMostInputTicks = 100'000;
 
-// InvalidArgument when it cannot be an input of a client: not finite, without a target, no valid kind.
+// InvalidArgument when it cannot be an input of a client, or of the control plane: not finite, without a target, no
+// valid kind.
 absl::Status CheckLiveInput(const Input& input);
 
 // What an input costs beside others: one over an area as much as many, since it may act on many bodies.
@@ -71,7 +77,8 @@ class LiveInputs {
   // Outcomes are kept for so many ticks, and clients that say nothing at least so long.
   static constexpr Tick kKeptTicks = 4096;
 
-  explicit LiveInputs(LiveLimits limits = {}) : limits_(limits) {}
+  // Changes of the layout go to `division`, which outlives this; null: they have no effect.
+  explicit LiveInputs(LiveLimits limits = {}, Division* division = nullptr) : limits_(limits), division_(division) {}
 
   // Takes an input for the next exchange, after CheckLiveInput.
   absl::Status Offer(const Input& input);
@@ -79,8 +86,9 @@ class LiveInputs {
 
   // Of what was offered, in order, what may be told to all in one tick.
   std::vector<Input> TakeOffered();
-  // What a region told; it takes effect at tick `effect`, a spawn at tick `spawn_effect`. Called alike in every region:
-  // same order, same ticks. `mine`: this region told it.
+  // What a region told; it takes effect at tick `effect`, a spawn at tick `spawn_effect`, a change of the layout
+  // kLayoutNotice after the tick before `effect`. Called alike in every region: same order, same ticks. `mine`: this
+  // region told it.
   void Deliver(const std::vector<Input>& inputs, Tick effect, Tick spawn_effect, bool mine);
   const InputSchedule& due() const { return due_; }
   // Forgets inputs of ticks before n.
@@ -100,14 +108,23 @@ class LiveInputs {
   // Since the last call: every input that will take effect, with its tick, the same in all regions.
   std::vector<Input> TakeDelivered() { return std::exchange(delivered_, {}); }
 
+  // What all regions know alike, for one that joins them: it then knows it too.
+  void Teach(Writer& a) const { const_cast<LiveInputs*>(this)->VisitCommon(a); }
+  void Learn(Reader& a);
+
   // All but the limits.
   template <class Archive>
   void Visit(Archive& a) {
-    a(offered_, due_, bodies_, lasting_, lasting_cost_, next_body_, open_, effect_, sources_, by_silence_, recent_,
-      outcome_of_, applied_, outcomes_, delivered_);
+    VisitCommon(a);
+    a(offered_, applied_, outcomes_, delivered_);
   }
 
  private:
+  template <class Archive>
+  void VisitCommon(Archive& a) {
+    a(due_, bodies_, lasting_, lasting_cost_, next_body_, open_, effect_, sources_, by_silence_, recent_, outcome_of_);
+  }
+
   struct Source {
     uint64_t last = 0;  // sequence delivered
     Tick heard = 0;     // when it took effect
@@ -123,20 +140,23 @@ class LiveInputs {
     bool removes_live = false;  // a body that a client spawned
     bool full = false;
     BodyId spawned = 0;
+    std::string refused;
     int mine = 0;  // how often it was offered here
 
     template <class Archive>
     void Visit(Archive& a) {
-      a(bodies, over_area, removes_live, full, spawned, mine);
+      a(bodies, over_area, removes_live, full, spawned, refused, mine);
     }
   };
 
   Source* Find(uint64_t source, Tick effect);
   bool TakeLasting(const Input& input, Tick effect);
+  void ChangeLayout(const Input& told, Tick effect, bool mine);
   void Repeated(const InputName& name);
   void Keep(const InputOutcome& outcome);
 
   const LiveLimits limits_;
+  Division* const division_;
   std::deque<Input> offered_;
   InputSchedule due_;
   int64_t bodies_ = 0;                // of clients
@@ -146,7 +166,7 @@ class LiveInputs {
   std::map<std::pair<Tick, InputName>, Open> open_;  // not settled
   std::map<InputName, Tick> effect_;                 // of these
   absl::flat_hash_map<uint64_t, Source> sources_;
-  std::set<std::pair<Tick, uint64_t>> by_silence_;           // when each was heard last
+  std::set<std::pair<Tick, uint64_t>> by_silence_;           // when each was heard last; clients only
   std::deque<InputOutcome> recent_;                          // ticks ascend
   absl::flat_hash_map<InputName, InputOutcome> outcome_of_;  // of these
   std::vector<AppliedInput> applied_;

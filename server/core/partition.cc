@@ -1,5 +1,6 @@
 #include "server/core/partition.h"
 
+#include <algorithm>
 #include <cmath>
 #include <limits>
 #include <set>
@@ -90,12 +91,22 @@ absl::StatusOr<Layout> Layout::Bricks(std::span<const double> x_edges, std::span
   return Layout(std::move(regions));
 }
 
-absl::StatusOr<Layout> Layout::Rectangles(std::vector<Rect> regions) {
+absl::StatusOr<Layout> Layout::Rectangles(std::vector<Rect> regions) { return Tiling(std::move(regions), false); }
+
+absl::StatusOr<Layout> Layout::WithRanks(std::vector<Rect> regions, std::vector<int> ranks) {
+  absl::StatusOr<Layout> layout = Tiling(std::move(regions), true);
+  if (!layout.ok()) return layout;
+  if (absl::Status s = layout->SetRanks(std::move(ranks)); !s.ok()) return s;
+  return layout;
+}
+
+absl::StatusOr<Layout> Layout::Tiling(std::vector<Rect> regions, bool some_without_area) {
   if (regions.empty()) return absl::InvalidArgumentError("regions: must not be empty");
   std::set<double> xs{-kInf, kInf}, zs{-kInf, kInf};
   for (size_t i = 0; i < regions.size(); ++i) {
     const Rect& r = regions[i];
-    if (!(r.min_x < r.max_x) || !(r.min_z < r.max_z)) {
+    if (some_without_area && r == Rect{}) continue;
+    if (!r.HasArea()) {
       return absl::InvalidArgumentError(absl::StrCat("regions[", i, "]: is empty: ", Show(r)));
     }
     xs.insert({r.min_x, r.max_x});
@@ -144,7 +155,9 @@ RegionId Layout::Home(double x, double z) const {
   for (RegionId r = 0; r < size(); ++r) {
     if (regions_[r].Contains(x, z)) return r;
   }
-  return 0;  // only for a point that is not finite: it must have some home until it is refused
+  // Only a point that is not finite is nowhere; it must have some home until it is refused.
+  return static_cast<RegionId>(
+      std::find_if(regions_.begin(), regions_.end(), [](const Rect& r) { return r.HasArea(); }) - regions_.begin());
 }
 
 int Layout::ChainNumber(double reach) const {
@@ -152,6 +165,7 @@ int Layout::ChainNumber(double reach) const {
   // lower edge of one.
   std::set<double> xs, zs;
   for (const Rect& r : regions_) {
+    if (!r.HasArea()) continue;
     xs.insert(std::isinf(r.min_x) ? -1e12 : r.min_x - reach);
     zs.insert(std::isinf(r.min_z) ? -1e12 : r.min_z - reach);
   }
@@ -160,7 +174,8 @@ int Layout::ChainNumber(double reach) const {
     for (double z : zs) {
       int depth = 0;
       for (const Rect& r : regions_) {
-        depth += x >= r.min_x - reach && x <= r.max_x + reach && z >= r.min_z - reach && z <= r.max_z + reach;
+        depth +=
+            r.HasArea() && x >= r.min_x - reach && x <= r.max_x + reach && z >= r.min_z - reach && z <= r.max_z + reach;
       }
       deepest = std::max(deepest, depth);
     }
@@ -170,7 +185,9 @@ int Layout::ChainNumber(double reach) const {
 
 double Layout::NarrowestExtent() const {
   double narrowest = kInf;
-  for (const Rect& r : regions_) narrowest = std::min({narrowest, r.max_x - r.min_x, r.max_z - r.min_z});
+  for (const Rect& r : regions_) {
+    if (r.HasArea()) narrowest = std::min({narrowest, r.max_x - r.min_x, r.max_z - r.min_z});
+  }
   return narrowest;
 }
 

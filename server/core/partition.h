@@ -13,7 +13,7 @@
 namespace aureole {
 
 // The home rectangles of all regions and their ranks. Every point of the x,z plane has exactly one home (P26). The
-// lower rank number is the better rank: it attracts, the others push (P27).
+// lower rank number is the better rank: it attracts, the others push (P27). A region without area is no point's home.
 class Layout {
  public:
   // Columns along x: finite edges at `edges` (ascending), so edges.size() + 1 regions.
@@ -26,12 +26,16 @@ class Layout {
   // Any rectangles that tile the plane. InvalidArgument names two that overlap, or a point that none covers.
   static absl::StatusOr<Layout> Rectangles(std::vector<Rect> regions);
 
+  // The same, but a region may have no area (Rect{}), and with ranks as SetRanks takes them.
+  static absl::StatusOr<Layout> WithRanks(std::vector<Rect> regions, std::vector<int> ranks);
+
   // Replaces the ranks (default: rank i = region i). InvalidArgument unless a permutation of 0..n-1.
   absl::Status SetRanks(std::vector<int> ranks);
 
   int size() const { return static_cast<int>(regions_.size()); }
   const Rect& rect(RegionId r) const { return regions_[r]; }
   int rank(RegionId r) const { return ranks_[r]; }
+  bool has_area(RegionId r) const { return rect(r).HasArea(); }
 
   // The region whose half-open rectangle holds the point. Linear in the regions.
   RegionId Home(double x, double z) const;
@@ -43,8 +47,16 @@ class Layout {
   // The smallest finite extent of any region; infinite when there is none.
   double NarrowestExtent() const;
 
+  friend bool operator==(const Layout&, const Layout&) = default;
+
+  template <class Archive>
+  void Visit(Archive& a) {
+    a(regions_, ranks_);
+  }
+
  private:
   explicit Layout(std::vector<Rect> regions);
+  static absl::StatusOr<Layout> Tiling(std::vector<Rect> regions, bool some_without_area);
   std::vector<Rect> regions_;
   std::vector<int> ranks_;
 };

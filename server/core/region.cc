@@ -7,6 +7,7 @@
 
 #include "server/core/check.h"
 #include "server/core/holdings.h"
+#include "server/core/limits.h"
 
 namespace aureole {
 
@@ -20,25 +21,28 @@ double InitialMargin(const World& world) {
   return (MarginsFor(world).predict + 4 * k + 2) * step;
 }
 
-absl::Status CheckRegions(const Graph& g, int regions) {
-  const auto known = [regions](RegionId r) { return r >= 0 && r < regions; };
-  const auto all_others = [&](const std::vector<RegionId>& list) {
-    return std::all_of(list.begin(), list.end(), [&](RegionId r) { return known(r) && r != g.of; });
-  };
-  if (!known(g.of)) return absl::InvalidArgumentError("frame.graphs.of: no such region");
-  for (const Fragment& f : g.fragments) {
-    if (f.gives_back != kNoRegion && !known(f.gives_back)) {
-      return absl::InvalidArgumentError("frame.graphs.fragments.gives_back: no such region");
-    }
-    for (const auto& [home, kg] : f.mass_by_home) {
-      if (!known(home)) return absl::InvalidArgumentError("frame.graphs.fragments.mass_by_home: no such region");
-    }
+absl::Status RefuseWithDelay(const World& world) {
+  if (world.exchange.k == 0) return absl::OkStatus();
+  return absl::InvalidArgumentError(
+      absl::StrCat("input.kind: the layout cannot change while the world runs, because its exchange has a delay of ",
+                   world.exchange.k, " ticks; use the synchronous exchange"));
+}
+
+// It is of the layout with which this region joins, and of the tick before that.
+absl::Status CheckWelcome(const Holdings& h, const Frame& frame) {
+  Division division = h.division;
+  LiveInputs live;
+  Reader reader(frame.welcome);
+  reader(division);
+  live.Learn(reader);
+  if (!reader.done()) return absl::InvalidArgumentError("frame.welcome: was written by another program");
+  const Division::State &told = division.now(), &own = h.division.now();
+  if (told.epoch != own.epoch || told.members != own.members || !(told.layout == own.layout) ||
+      division.next_at() != 0) {
+    return absl::InvalidArgumentError(absl::StrCat("frame.welcome: to the layout of epoch ", told.epoch,
+                                                   ", where region ", h.self, " joins with another of epoch ",
+                                                   own.epoch));
   }
-  for (const LateAura& l : g.late) {
-    if (!known(l.to) || l.to == g.of) return absl::InvalidArgumentError("frame.graphs.late.to: no such region");
-  }
-  if (!all_others(g.opened)) return absl::InvalidArgumentError("frame.graphs.opened: no such other region");
-  if (!all_others(g.closed)) return absl::InvalidArgumentError("frame.graphs.closed: no such other region");
   return absl::OkStatus();
 }
 
@@ -60,18 +64,18 @@ absl::Status FindSpawn(const World& world, Input* spawn) {
 }  // namespace
 
 struct Region::Impl {
-  Impl(const World& world, RegionId self, std::unique_ptr<Engine> engine) : holdings(world, self, std::move(engine)) {
-    AUREOLE_CHECK(self >= 0 && self < world.layout.size(), "region %d of %d", self, world.layout.size());
-  }
-  void MakeProtocol() {
-    protocol = holdings.world.exchange.k == 0 ? MakeSyncExchange(holdings) : MakeDelayedExchange(holdings);
+  Impl(const World& world, RegionId self, std::unique_ptr<Engine> engine, Division division)
+      : holdings(world, self, std::move(engine), std::move(division)) {}
+  void MakeProtocol(bool joins = false) {
+    protocol = holdings.world.exchange.k == 0 ? MakeSyncExchange(holdings, joins) : MakeDelayedExchange(holdings);
   }
   Holdings holdings;
   std::unique_ptr<Protocol> protocol;
 };
 
 Region::Region(const World& world, RegionId self, std::unique_ptr<Engine> engine)
-    : impl_(std::make_unique<Impl>(world, self, std::move(engine))) {
+    : impl_(std::make_unique<Impl>(world, self, std::move(engine), Division(world.layout))) {
+  AUREOLE_CHECK(self >= 0 && self < world.layout.size(), "region %d of %d", self, world.layout.size());
   // What will soon be in reach starts on one region; the exchange keeps it so.
   impl_->holdings.LoadInitialState(InitialMargin(world));
   impl_->MakeProtocol();
@@ -81,8 +85,7 @@ Region::Region(std::unique_ptr<Impl> impl) : impl_(std::move(impl)) {}
 
 absl::StatusOr<std::unique_ptr<Region>> Region::Load(const World& world, RegionId self, std::unique_ptr<Engine> engine,
                                                      std::string_view saved) {
-  auto impl = std::make_unique<Impl>(world, self, std::move(engine));
-  impl->MakeProtocol();
+  auto impl = std::make_unique<Impl>(world, self, std::move(engine), Division(world.layout));
   Reader reader(saved);
   RegionId of = kNoRegion;
   int regions = 0;
@@ -92,41 +95,81 @@ absl::StatusOr<std::unique_ptr<Region>> Region::Load(const World& world, RegionI
                                                    self, " of ", world.layout.size()));
   }
   const bool loaded = impl->holdings.Load(reader);
-  if (loaded) impl->protocol->Load(reader);
+  if (loaded) {
+    impl->MakeProtocol();
+    impl->protocol->Load(reader);
+  }
   if (!loaded || !reader.done()) {
     return absl::InvalidArgumentError("checkpoint: is damaged, or was written by another program");
   }
   return std::unique_ptr<Region>(new Region(std::move(impl)));
 }
+
+absl::StatusOr<std::unique_ptr<Region>> Region::Join(const World& world, RegionId self, std::unique_ptr<Engine> engine,
+                                                     const LayoutChange& change) {
+  if (absl::Status s = RefuseWithDelay(world); !s.ok()) return s;
+  if (absl::Status s = LayoutOf(change).status(); !s.ok()) return s;
+  if (!std::binary_search(change.members.begin(), change.members.end(), self)) {
+    return absl::InvalidArgumentError(absl::StrCat("members: must name region ", self, ", which joins"));
+  }
+  auto impl = std::make_unique<Impl>(world, self, std::move(engine), Division(change));
+  impl->MakeProtocol(true);
+  return std::unique_ptr<Region>(new Region(std::move(impl)));
+}
+
 Region::~Region() = default;
 
 RegionId Region::self() const { return impl_->holdings.self; }
 Tick Region::tick() const { return impl_->holdings.tick; }
 Phase Region::phase() const { return impl_->protocol->phase(); }
 const std::vector<RegionId>& Region::peers() const { return impl_->holdings.peers; }
+const Layout& Region::layout() const { return impl_->holdings.layout(); }
+uint64_t Region::layout_epoch() const { return impl_->holdings.division.now().epoch; }
+const std::vector<RegionId>& Region::members() const { return impl_->holdings.division.now().members; }
+Tick Region::next_layout_at() const { return impl_->holdings.division.next_at(); }
+const Layout& Region::next_layout() const { return impl_->holdings.division.next().layout; }
+const std::vector<RegionId>& Region::next_members() const { return impl_->holdings.division.next().members; }
 
 absl::Status Region::Receive(Frame frame) {
   Holdings& h = impl_->holdings;
-  auto it = h.inboxes.find(frame.from);
-  if (it == h.inboxes.end()) {
+  const bool synchronous = h.world.exchange.k == 0, joins = phase() == Phase::kJoin;
+  // Null: of a tick whose layout nobody knows yet. Only a region that repeats what it had done hears of such a tick;
+  // when it comes there, the layout is known (Protocol).
+  const Division::State* division = synchronous && !joins ? h.division.At(frame.tick, h.tick) : &h.division.now();
+  const bool peer = frame.from != h.self && (division != nullptr ? division->IsMember(frame.from)
+                                                                 : frame.from >= 0 && frame.from < limits::kMaxRegions);
+  if (!peer) {
     return absl::InvalidArgumentError(absl::StrCat("frame.from: ", frame.from, " is no peer of region ", h.self));
   }
   if (!std::binary_search(frame.to.begin(), frame.to.end(), h.self)) {
     return absl::InvalidArgumentError(absl::StrCat("frame.to: does not name region ", h.self));
   }
-  for (const Graph& g : frame.graphs) {
-    if (absl::Status s = CheckRegions(g, h.world.layout.size()); !s.ok()) return s;
+  if (division != nullptr) {
+    if (!division->IsMember(h.self)) {
+      return absl::InvalidArgumentError(
+          absl::StrCat("frame.tick: region ", h.self, " has no part in tick ", frame.tick));
+    }
+    if (absl::Status s = CheckRegions(frame, *division); !s.ok()) return s;
+    if (!impl_->protocol->MaySend(frame.from, frame.round, *division)) {
+      return absl::InvalidArgumentError(
+          absl::StrCat("frame.round: ", frame.round, " is not for region ", frame.from, " to send to region ", h.self));
+    }
   }
   for (Transfer& t : frame.transfers) {
     for (Input& i : t.pending) {
       if (absl::Status s = FindSpawn(h.world, &i); !s.ok()) return s;
     }
   }
-  if (!impl_->protocol->MaySend(frame.from, frame.round)) {
-    return absl::InvalidArgumentError(
-        absl::StrCat("frame.round: ", frame.round, " is not for region ", frame.from, " to send to region ", h.self));
+  if (frame.round == kWelcome) {
+    if (absl::Status s = CheckWelcome(h, frame); !s.ok()) return s;
   }
-  return it->second.Accept(std::move(frame), h.tick, h.world.exchange.k == 0);
+  const Tick now = joins ? frame.tick : h.tick;
+  Inbox fresh;  // kept only when the frame is good
+  const auto it = h.inboxes.find(frame.from);
+  const RegionId from = frame.from;
+  absl::Status s = (it == h.inboxes.end() ? fresh : it->second).Accept(std::move(frame), now, synchronous);
+  if (s.ok() && it == h.inboxes.end()) h.inboxes.emplace(from, std::move(fresh));
+  return s;
 }
 
 bool Region::Ready() const { return impl_->protocol->Ready(); }
@@ -137,7 +180,12 @@ void Region::Advance(std::vector<Frame>* out) {
   impl_->protocol->Advance(out);
 }
 
-absl::Status Region::Submit(const Input& input) { return impl_->holdings.live.Offer(input); }
+absl::Status Region::Submit(const Input& input) {
+  if (input.kind == Input::Kind::kLayout) {
+    if (absl::Status s = RefuseWithDelay(impl_->holdings.world); !s.ok()) return s;
+  }
+  return impl_->holdings.live.Offer(input);
+}
 size_t Region::inputs_waiting() const { return impl_->holdings.live.offered(); }
 std::vector<InputOutcome> Region::TakeOutcomes() { return impl_->holdings.live.TakeOutcomes(); }
 std::vector<Input> Region::TakeDelivered() { return impl_->holdings.live.TakeDelivered(); }
@@ -178,7 +226,10 @@ std::string Region::Save() const {
   return out;
 }
 
-uint64_t Region::FramesTaken(RegionId peer) const { return impl_->holdings.inboxes.at(peer).taken(); }
+uint64_t Region::FramesTaken(RegionId peer) const {
+  const auto it = impl_->holdings.inboxes.find(peer);
+  return it == impl_->holdings.inboxes.end() ? 0 : it->second.taken();
+}
 
 void Region::AppendAuras(size_t most, std::vector<WireBox>* out) const { impl_->protocol->AppendAuras(most, out); }
 

@@ -6,6 +6,8 @@
 //           row.  kRelay: needs the row's graphs; passes them on.  kDecide: needs the other rows' graphs; transfers, or
 //           once more from kRelay on when a box was told late.  kArrive: needs the transfers of those that send one.
 //           kStep.
+//           Before the first tick, kJoin: a region that joins a running world needs the welcome of a peer. After the
+//           last, kLeft: a region that is no member any more; it is never ready again.
 //   k >= 1  kBegin: needs the frames of tick n-k of all; applies them and the inputs.  kStep: steps, detects, decides,
 //           -> the frames of tick n.
 // (PROTOCOL.md sections 4 and 10; the tick order is P22.)
@@ -28,7 +30,7 @@
 
 namespace aureole {
 
-enum class Phase : uint8_t { kBegin, kGraph, kRelay, kDecide, kArrive, kStep };
+enum class Phase : uint8_t { kBegin, kGraph, kRelay, kDecide, kArrive, kStep, kJoin, kLeft };
 
 inline constexpr Tick kSlackTicks = 32;
 
@@ -109,6 +111,12 @@ class Region {
   // bytes are not of this region and world.
   static absl::StatusOr<std::unique_ptr<Region>> Load(const World& world, RegionId self, std::unique_ptr<Engine> engine,
                                                       std::string_view saved);
+  // A region that joins a world that runs (k = 0), with the layout that the change describes: one that does not name
+  // `self` as a member now, and will when it is in force. Empty, and at Phase::kJoin until then; from the tick on in
+  // which the layout takes effect it is as any other. When the change comes to nothing, the region does.
+  // InvalidArgument names the field.
+  static absl::StatusOr<std::unique_ptr<Region>> Join(const World& world, RegionId self, std::unique_ptr<Engine> engine,
+                                                      const LayoutChange& change);
   ~Region();
   Region(const Region&) = delete;
   Region& operator=(const Region&) = delete;
@@ -117,11 +125,20 @@ class Region {
   // The last tick that was stepped.
   Tick tick() const;
   Phase phase() const;
-  // Every region this one may exchange frames with, ascending: all others.
+  // Every region this one may exchange frames with, ascending: all other members.
   const std::vector<RegionId>& peers() const;
+  // What is in force in the tick that has begun, or at kBegin in the one that was stepped.
+  const Layout& layout() const;
+  uint64_t layout_epoch() const;
+  const std::vector<RegionId>& members() const;
+  // What will be, from tick next_layout_at() on; 0: no change is pending.
+  Tick next_layout_at() const;
+  const Layout& next_layout() const;
+  const std::vector<RegionId>& next_members() const;
 
   // Takes the next frame of a peer. Frames of one peer come in the order it sent them, each once. InvalidArgument when
-  // the frame cannot be one of the protocol's (wrong sender, tick, round, box, id); then nothing changes.
+  // the frame cannot be one of the protocol's (wrong sender, tick, round, box, id); then nothing changes. A peer may be
+  // ahead, under a layout that is not in force here yet, and may be one that joins with it.
   absl::Status Receive(Frame frame);
   // Whether Advance may be called. At kBegin the caller also decides when it is time for the tick.
   bool Ready() const;
@@ -134,6 +151,8 @@ class Region {
   // the next exchange and takes effect at the start of the tick after that one (k = 0), or as many ticks later as the
   // delay demands; nothing is known of the body until then. Sequences of one source must grow: one that does not has
   // been taken before, here or elsewhere, and acts only once. InvalidArgument names the field; then nothing changes.
+  // A change of the layout (source kControlSource; k = 0) is in force kLayoutNotice ticks after all have heard of it,
+  // or its outcome says why it is not.
   absl::Status Submit(const Input& input);
   // Of what was submitted, that which waits for an exchange with room for it.
   size_t inputs_waiting() const;
@@ -158,7 +177,8 @@ class Region {
   // does. Precondition: the phase is kBegin. Linear in the bodies.
   std::string Save() const;
   // Frames of this peer that were taken by phases since the beginning of the world, by this region and those that it
-  // was loaded from. Those that only wait are not in Save, and must come again after Load.
+  // was loaded from. Those that only wait are not in Save, and must come again after Load. Counted anew when a peer
+  // that had left is a member again.
   uint64_t FramesTaken(RegionId peer) const;
 
   // At most so many of the boxes that peers hold of this region's bodies, each body once, in no order. Linear in them.

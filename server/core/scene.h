@@ -109,6 +109,18 @@ struct Area {
   bool fades = false;  // `outward` falls off linearly, to 0 at the radius
 };
 
+// How the world is to be divided from some tick on (server/core/division.h).
+struct LayoutChange {
+  uint64_t epoch = 0;             // of the layout; one more than that of the layout before
+  std::vector<Rect> regions;      // by RegionId; Rect{}: without area. No fewer than before
+  std::vector<int> ranks;         // one per region, a permutation of 0..n-1
+  std::vector<RegionId> members;  // those that have a server, ascending; all that have an area are
+  friend bool operator==(const LayoutChange&, const LayoutChange&) = default;
+};
+
+// Of inputs: what the control plane says. No client's.
+inline constexpr uint64_t kControlSource = ~uint64_t{0};
+
 // What changes a running world. Takes effect at the start of a tick, before its exchange and step (PROTOCOL.md R13);
 // inputs of one tick apply in (source, sequence) order.
 struct Input {
@@ -118,6 +130,7 @@ struct Input {
     kImpulse = 3,         // `linear` N s at `point` and `angular` N m s; wakes
     kVelocity = 4,        // sets both velocities; wakes
     kVelocityChange = 5,  // adds to both velocities; wakes
+    kLayout = 6,          // `layout`, of the control plane; changes no body
   };
   // Of the point where a linear impulse acts.
   enum class Frame : uint8_t {
@@ -126,7 +139,7 @@ struct Input {
     kBody = 2,  // turns with the body; the centre of mass is its origin
   };
   Tick tick = 0;
-  uint64_t source = 0;    // 0: the world's script; else a client
+  uint64_t source = 0;    // 0: the world's script; kControlSource; else a client
   uint64_t sequence = 0;  // grows with every input of a source
   Kind kind = Kind::kImpulse;
   BodyId body = 0;  // of a spawn: that of `spawn`
@@ -139,6 +152,7 @@ struct Input {
   Tick ticks = 1;
   bool again = false;  // this is not the first of them
   std::shared_ptr<const BodySpec> spawn;
+  std::shared_ptr<const LayoutChange> layout;
 
   bool over_area() const { return area.radius > 0; }
 

@@ -28,15 +28,23 @@ constexpr double kSpare = 1e-3;
 // decides how often boxes are told late, and nothing else. Half a metre is a tick at 32 m/s.
 constexpr double kOpenAhead = 0.5;
 constexpr Tick kStayOpen = 64;
+// Islands go home a few at a time, so that no tick is long when a new layout gives many a new home: so many bodies in
+// a tick, or one island.
+constexpr int64_t kMostReturned = 512;
 
 class SyncExchange final : public Protocol {
  public:
-  explicit SyncExchange(Holdings& holdings)
-      : h_(holdings), gather_(h_.world.layout.size(), h_.self), open_(h_.peers.size()) {}
+  SyncExchange(Holdings& holdings, bool joins)
+      : h_(holdings),
+        gather_(h_.division.now().members, h_.self),
+        open_(h_.peers.size()),
+        phase_(joins ? Phase::kJoin : Phase::kBegin) {}
 
   Phase phase() const override { return phase_; }
 
   bool Ready() const override {
+    if (phase_ == Phase::kJoin) return Sponsor() != kNoRegion;
+    if (phase_ == Phase::kLeft) return false;
     for (RegionId p : h_.peers) {
       if (!HasFrame(p)) return false;
     }
@@ -44,6 +52,8 @@ class SyncExchange final : public Protocol {
   }
 
   void Missing(std::vector<RegionId>* out) const override {
+    if (phase_ == Phase::kJoin && !Ready()) *out = h_.peers;  // any of them may be the sponsor
+    if (phase_ == Phase::kJoin) return;
     for (RegionId p : h_.peers) {
       if (!HasFrame(p)) out->push_back(p);
     }
@@ -51,6 +61,10 @@ class SyncExchange final : public Protocol {
 
   void Advance(std::vector<Frame>* out) override {
     switch (phase_) {
+      case Phase::kJoin:
+        return Join();
+      case Phase::kLeft:
+        return;
       case Phase::kBegin:
         return Begin(out);
       case Phase::kGraph:
@@ -66,14 +80,15 @@ class SyncExchange final : public Protocol {
         h_.MeasureSlack(now());
         h_.engine->Step(now());
         ++h_.tick;
-        phase_ = Phase::kBegin;
+        phase_ = Next().IsMember(h_.self) ? Phase::kBegin : Phase::kLeft;
     }
   }
 
-  bool MaySend(RegionId peer, int round) const override {
-    if (round == kGraphs || round == kGraphsAgain) return Contains(gather_.row, peer);
-    if (round == kGraphsOn || round == kGraphsAgainOn) return Contains(gather_.sources, peer);
-    return round == kBoxes || round == kTransfers;
+  bool MaySend(RegionId peer, int round, const Division::State& division) const override {
+    const Allgather gather = &division == &h_.division.now() ? gather_ : Allgather(division.members, h_.self);
+    if (round == kGraphs || round == kGraphsAgain) return Contains(gather.row, peer);
+    if (round == kGraphsOn || round == kGraphsAgainOn) return Contains(gather.sources, peer);
+    return round == kBoxes || round == kTransfers || (round == kWelcome && phase_ == Phase::kJoin);
   }
 
   void ObserveInFlight(std::vector<BodyRecord>*) const override {}
@@ -148,7 +163,18 @@ class SyncExchange final : public Protocol {
   static bool Contains(const std::vector<RegionId>& list, RegionId r) {
     return std::binary_search(list.begin(), list.end(), r);
   }
-  size_t PeerIndex(RegionId peer) const { return static_cast<size_t>(peer > h_.self ? peer - 1 : peer); }
+  size_t PeerIndex(RegionId peer) const {
+    return static_cast<size_t>(std::lower_bound(h_.peers.begin(), h_.peers.end(), peer) - h_.peers.begin());
+  }
+
+  // What came long before its tick, in a region that repeats what it had done, was not held against its layout then.
+  Frame Pop(RegionId peer) {
+    Frame f = h_.inboxes.at(peer).Pop();
+    const absl::Status s = CheckRegions(f, h_.division.now());
+    AUREOLE_CHECK(s.ok(), "region %d sent what is not of tick %lld: %s", peer, static_cast<long long>(now()),
+                  std::string(s.message()).c_str());
+    return f;
+  }
 
   Frame MakeFrame(std::vector<RegionId> to, int round) const {
     Frame f;
@@ -159,13 +185,89 @@ class SyncExchange final : public Protocol {
     return f;
   }
 
+  // In force in the next tick.
+  const Division::State& Next() const { return *h_.division.At(now(), h_.tick); }
+
+  // Of a region that joins: who has sent the welcome; kNoRegion: nobody yet.
+  RegionId Sponsor() const {
+    for (RegionId p : h_.peers) {
+      const Frame* f = h_.inboxes.at(p).Front();
+      if (f != nullptr && f->round == kWelcome) return p;
+    }
+    return kNoRegion;
+  }
+
+  void Join() {
+    const RegionId sponsor = Sponsor();
+    const Frame f = h_.inboxes.at(sponsor).Pop();
+    Reader reader(f.welcome);
+    reader(h_.division);
+    h_.live.Learn(reader);
+    AUREOLE_CHECK(reader.done(), "region %d cannot read the welcome of region %d", h_.self, sponsor);
+    h_.tick = f.tick;
+    OpenToChanged(nullptr);
+    phase_ = Phase::kBegin;
+  }
+
+  void AdoptLayout(std::vector<Frame>* out) {
+    const Division::State before = h_.division.now();
+    if (!h_.division.Adopt(now())) return;
+    const std::vector<RegionId> peers = h_.peers;
+    const std::vector<Opening> open = std::move(open_);
+    h_.FollowDivision();
+    gather_ = Allgather(h_.division.now().members, h_.self);
+    open_.assign(h_.peers.size(), {});
+    for (size_t i = 0; i < peers.size(); ++i) {
+      if (Contains(h_.peers, peers[i])) {
+        open_[PeerIndex(peers[i])] = open[i];
+        continue;
+      }
+      told_.erase(peers[i]);
+      next_.erase(peers[i]);
+      remote_.erase(peers[i]);
+    }
+    OpenToChanged(&before);
+    SendWelcome(before, out);
+    // Who has a new home because of the layout has crossed nothing.
+    const int64_t crossings = h_.stats.home_crossings;
+    near_.clear();
+    h_.engine->CollectOutside(h_.rect, kOpenAhead, &near_);
+    h_.CountHomes(near_);
+    h_.stats.home_crossings = crossings;
+  }
+
+  // Where either rectangle is new, much may be near at once: such pairs are open from the start, and close as others
+  // do. A region that joins (`before` is null) is new to all.
+  void OpenToChanged(const Division::State* before) {
+    const auto changed = [&](RegionId r) {
+      return before == nullptr || !before->IsMember(r) || before->layout.rect(r) != h_.layout().rect(r);
+    };
+    for (size_t p = 0; p < h_.peers.size(); ++p) {
+      if (changed(h_.self) || changed(h_.peers[p])) open_[p] = {true, true, now()};
+    }
+  }
+
+  // The lowest of those that were there before and stay tells those that join.
+  void SendWelcome(const Division::State& before, std::vector<Frame>* out) {
+    std::vector<RegionId> stay, join;
+    for (RegionId r : h_.division.now().members) (before.IsMember(r) ? stay : join).push_back(r);
+    if (join.empty() || stay.front() != h_.self) return;
+    Frame f = MakeFrame(std::move(join), kWelcome);
+    f.tick = h_.tick;
+    Writer writer(&f.welcome);
+    writer(h_.division);
+    h_.live.Teach(writer);
+    out->push_back(std::move(f));
+  }
+
   // R13: everything with effect in this tick happens before its exchange. Then R14.
   void Begin(std::vector<Frame>* out) {
+    AdoptLayout(out);
     inputs_.clear();
     h_.AppendInputs(now(), &inputs_);
     h_.live.ForgetBefore(now() + 1);
     for (const Input& i : inputs_) {
-      const bool elsewhere = i.kind == Input::Kind::kSpawn && h_.world.layout.Home(i.spawn->position) != h_.self;
+      const bool elsewhere = i.kind == Input::Kind::kSpawn && h_.layout().Home(i.spawn->position) != h_.self;
       if (!elsewhere) h_.Apply(i);
     }
     near_.clear();
@@ -174,6 +276,7 @@ class SyncExchange final : public Protocol {
     BoundaryNetworkUpdate(out);
     mine_.inputs = h_.live.TakeOffered();
     mine_.applied = h_.live.TakeApplied();
+    mine_.emptied = Leaving() && h_.held.empty() && !h_.division.IsEmptied(h_.self);
     phase_ = Phase::kGraph;
     if (!h_.peers.empty()) return;
     graphs_.assign(1, mine_);
@@ -192,7 +295,7 @@ class SyncExchange final : public Protocol {
       const WireBox wire = RoundOutward(box);
       bool told = false;
       for (size_t p = 0; p < h_.peers.size(); ++p) {
-        const double gap = h_.world.layout.rect(h_.peers[p]).Gap(box);
+        const double gap = h_.layout().rect(h_.peers[p]).Gap(box);
         if (gap > kOpenAhead) continue;
         open_[p].last_near = now();
         if (gap > kSpare) continue;
@@ -286,14 +389,14 @@ class SyncExchange final : public Protocol {
   }
 
   void TakeGraphs(RegionId peer) {
-    Frame f = h_.inboxes.at(peer).Pop();
+    Frame f = Pop(peer);
     graphs_.insert(graphs_.end(), std::make_move_iterator(f.graphs.begin()), std::make_move_iterator(f.graphs.end()));
   }
 
   void TakeBoxes() {
     for (RegionId peer : h_.peers) {
       if (!open_[PeerIndex(peer)].Now()) continue;
-      Frame f = h_.inboxes.at(peer).Pop();
+      Frame f = Pop(peer);
       auto& boxes = remote_[peer];
       for (BodyId id : f.gone) boxes.erase(id);
       for (const Aura& a : f.auras) boxes[a.id] = Widen(a.box);
@@ -338,6 +441,7 @@ class SyncExchange final : public Protocol {
   // The contact components (joints included) of own bodies that hold a known one.
   void FindComponents(const std::vector<BodyId>& known) {
     components_.clear();
+    int64_t returned = 0;
     absl::flat_hash_set<BodyId> seen;
     std::vector<BodyId> reached;
     for (BodyId seed : known) {
@@ -359,9 +463,10 @@ class SyncExchange final : public Protocol {
                             std::back_inserter(c.wire.known));
       for (BodyId id : c.members) {
         const BodyView v = h_.engine->View(id);
-        AddMass(&c.wire.mass_by_home, Stays(v) ? h_.self : h_.world.layout.Home(v.centre), v.mass);
+        AddMass(&c.wire.mass_by_home, Stays(v) ? h_.self : h_.layout().Home(v.centre), v.mass);
       }
-      c.wire.gives_back = BoundaryTraverse(c);
+      if (returned < kMostReturned) c.wire.gives_back = BoundaryTraverse(c);
+      if (c.wire.gives_back != kNoRegion) returned += c.wire.bodies;
       components_.push_back(std::move(c));
     }
   }
@@ -369,12 +474,21 @@ class SyncExchange final : public Protocol {
   // A body that has hardly left counts as at home: who sways over the border, or is struck across it, moves less often.
   bool Stays(const BodyView& v) const { return h_.rect.Gap(v.box) <= h_.world.exchange.home_slack; }
 
+  // Without area, nothing is at home here, and what is here goes, whatever is near it.
+  bool Leaving() const { return !h_.rect.HasArea(); }
+
   // The paper's BT (Algorithm 2), by R20: an island goes home when none of it meets this region, nothing that is
   // foreign or stays here is near, and it has been here for a while. Returns its new owner, or kNoRegion.
   RegionId BoundaryTraverse(const Component& c) const {
+    if (!Leaving() && !MayReturn(c)) return kNoRegion;
+    const RegionId home = Heaviest(h_.layout(), c.wire.mass_by_home);
+    return home == h_.self ? kNoRegion : home;
+  }
+
+  bool MayReturn(const Component& c) const {
     for (BodyId id : c.members) {
-      if (now() - h_.held.at(id).arrived < h_.world.exchange.Dwell()) return kNoRegion;
-      if (Stays(h_.engine->View(id))) return kNoRegion;
+      if (now() - h_.held.at(id).arrived < h_.world.exchange.Dwell()) return false;
+      if (Stays(h_.engine->View(id))) return false;
     }
     const double gap = h_.world.exchange.return_gap;
     std::vector<BodyId> near;
@@ -383,15 +497,14 @@ class SyncExchange final : public Protocol {
       near.clear();
       h_.engine->Query(box.Inflated(gap), &near);
       for (BodyId other : near) {
-        if (Stays(h_.engine->View(other))) return kNoRegion;
+        if (Stays(h_.engine->View(other))) return false;
       }
       for (const Foreign& f : foreign_) {
         if (f.box.min.x() > box.max.x() + gap) break;
-        if (Gap(f.box, box) <= gap) return kNoRegion;
+        if (Gap(f.box, box) <= gap) return false;
       }
     }
-    const RegionId home = Heaviest(h_.world.layout, c.wire.mass_by_home);
-    return home == h_.self ? kNoRegion : home;
+    return true;
   }
 
   // R17, R19: all regions hold the same graphs, so all find the same components and the same owner for each.
@@ -430,6 +543,9 @@ class SyncExchange final : public Protocol {
   void HearInputs() {
     for (const Graph& g : graphs_) h_.live.Heard(g.applied);
     h_.live.Settle(now());
+    for (const Graph& g : graphs_) {
+      if (g.emptied) h_.division.Emptied(g.of);
+    }
     for (const Graph& g : graphs_) h_.live.Deliver(g.inputs, now() + 1, now() + 1, g.of == h_.self);
   }
 
@@ -508,7 +624,7 @@ class SyncExchange final : public Protocol {
     }
     h_.stats.largest_component = std::max(h_.stats.largest_component, bodies);
     h_.stats.longest_chain = std::max(h_.stats.longest_chain, static_cast<int64_t>(owners.size()));
-    const RegionId target = Heaviest(h_.world.layout, mass);
+    const RegionId target = Heaviest(h_.layout(), mass);
     std::vector<BodyId> ids;
     for (int i : members) {
       if (nodes[i].owner == target) continue;
@@ -530,7 +646,8 @@ class SyncExchange final : public Protocol {
         if (std::any_of(f.known.begin(), f.known.end(), [&linked](BodyId id) { return linked.contains(id); })) continue;
         if (f.gives_back == h_.self) senders_.insert(graph.of);
         if (graph.of == h_.self) {
-          Send(components_[i].members, f.gives_back, TransferCause::kBoundaryTraverse, leaving);
+          const TransferCause cause = Leaving() ? TransferCause::kDrain : TransferCause::kBoundaryTraverse;
+          Send(components_[i].members, f.gives_back, cause, leaving);
         }
       }
     }
@@ -547,7 +664,7 @@ class SyncExchange final : public Protocol {
 
   void TakeArrivals() {
     for (RegionId peer : senders_) {
-      const Frame f = h_.inboxes.at(peer).Pop();
+      const Frame f = Pop(peer);
       for (const Transfer& t : f.transfers) h_.Arrive(t, peer, now());
     }
     senders_.clear();
@@ -555,9 +672,9 @@ class SyncExchange final : public Protocol {
   }
 
   Holdings& h_;
-  const Allgather gather_;
+  Allgather gather_;
   std::vector<Opening> open_;  // parallel to the peers
-  Phase phase_ = Phase::kBegin;
+  Phase phase_;
   std::vector<Input> inputs_;
   std::vector<BodyId> near_;                         // own bodies whose box may touch another region
   std::vector<BodyId> told_ids_;                     // of these, told to anybody; ascending
@@ -573,6 +690,8 @@ class SyncExchange final : public Protocol {
 
 }  // namespace
 
-std::unique_ptr<Protocol> MakeSyncExchange(Holdings& holdings) { return std::make_unique<SyncExchange>(holdings); }
+std::unique_ptr<Protocol> MakeSyncExchange(Holdings& holdings, bool joins) {
+  return std::make_unique<SyncExchange>(holdings, joins);
+}
 
 }  // namespace aureole

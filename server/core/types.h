@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <cstdint>
+#include <limits>
 
 #include <Eigen/Core>
 #include <Eigen/Geometry>
@@ -16,7 +17,7 @@ using JointId = uint64_t;
 // Tick n is simulated time n * tick length. State n is the state after tick n was stepped; state 0 is the initial one.
 using Tick = int64_t;
 
-// Index of a region in its layout, 0..n-1.
+// Index of a region in its layout, 0..n-1. The same for as long as the region lives.
 using RegionId = int32_t;
 inline constexpr RegionId kNoRegion = -1;
 
@@ -46,5 +47,25 @@ inline double Gap(const Box& a, const Box& b) {
 }
 
 inline bool Overlap(const Box& a, const Box& b) { return Gap(a, b) <= 0; }
+
+// Half-open rectangle in x and z; y is unbounded; outer edges may be infinite. Rect{}, and only that, is no area: it
+// holds no point, encloses nothing, and is infinitely far from everything.
+struct Rect {
+  double min_x = 0, max_x = 0, min_z = 0, max_z = 0;
+
+  bool HasArea() const { return min_x < max_x && min_z < max_z; }
+  bool Contains(double x, double z) const { return x >= min_x && x < max_x && z >= min_z && z < max_z; }
+  // Whether the box lies wholly in the closed rectangle shrunk by `margin` on each finite side.
+  bool Encloses(const Box& b, double margin) const {
+    return HasArea() && b.min.x() >= min_x + margin && b.max.x() <= max_x - margin && b.min.z() >= min_z + margin &&
+           b.max.z() <= max_z - margin;
+  }
+  // Chebyshev distance in x, z from the box to the closed rectangle; zero or less iff they meet.
+  double Gap(const Box& b) const {
+    if (!HasArea()) return std::numeric_limits<double>::infinity();
+    return std::max(std::max(min_x - b.max.x(), b.min.x() - max_x), std::max(min_z - b.max.z(), b.min.z() - max_z));
+  }
+  friend bool operator==(const Rect&, const Rect&) = default;
+};
 
 }  // namespace aureole

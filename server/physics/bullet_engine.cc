@@ -112,6 +112,7 @@ void BulletEngine::Apply(const Input& input) {
   const btVector3 linear = ToBullet(input.linear), angular = ToBullet(input.angular);
   switch (input.kind) {
     case Input::Kind::kSpawn:
+    case Input::Kind::kLayout:
       break;
     case Input::Kind::kRemove:
       world_.WakeNeighbours(body);

@@ -92,6 +92,7 @@ void EncodeGraph(const Graph& g, v1::Frame::Graph* out) {
     out->add_applied_sequence(a.name.second);
     out->add_applied_bodies(static_cast<uint64_t>(a.bodies));
   }
+  out->set_emptied(g.emptied);
 }
 
 bool WithinLimits(const Graph& g) {
@@ -285,6 +286,7 @@ absl::Status DecodeGraph(const v1::Frame::Graph& in, Graph* out) {
     out->applied.push_back(
         {{in.applied_source(i), in.applied_sequence(i)}, static_cast<int64_t>(in.applied_bodies(i))});
   }
+  out->emptied = in.emptied();
   return absl::OkStatus();
 }
 
@@ -345,6 +347,7 @@ std::string EncodeFrame(const Frame& frame) {
   for (BodyId id : frame.gone) gone.Add(id);
   for (const Graph& g : frame.graphs) EncodeGraph(g, out.add_graph());
   for (const Transfer& t : frame.transfers) EncodeTransfer(t, out.add_transfer());
+  out.set_welcome(frame.welcome);
   IdWriter away(out.mutable_away_id());
   for (const Away& a : frame.away) {
     away.Add(a.id);
@@ -372,7 +375,7 @@ absl::StatusOr<Frame> DecodeFrame(std::string_view bytes, RegionId from, RegionI
   out.to = {to};
   out.round = static_cast<int>(in.phase() % 8);
   out.tick = static_cast<Tick>(in.phase() / 8);
-  if (out.round > kTransfers) return Bad("phase", absl::StrCat("no round ", out.round));
+  if (out.round > kWelcome) return Bad("phase", absl::StrCat("no round ", out.round));
   AUREOLE_RETURN_IF_ERROR(DecodeAuras(in, &out.auras));
   AUREOLE_RETURN_IF_ERROR(DecodeIds("gone_id", in.gone_id(), kMaxAuras, false, &out.gone));
   AUREOLE_RETURN_IF_ERROR(CheckCount("graph", in.graph_size(), kMaxRegions));
@@ -383,6 +386,7 @@ absl::StatusOr<Frame> DecodeFrame(std::string_view bytes, RegionId from, RegionI
   for (int i = 0; i < in.transfer_size(); ++i) {
     AUREOLE_RETURN_IF_ERROR(DecodeTransfer(in.mutable_transfer(i), &out.transfers[i]));
   }
+  out.welcome = std::move(*in.mutable_welcome());
   std::vector<BodyId> away;
   AUREOLE_RETURN_IF_ERROR(DecodeIds("away_id", in.away_id(), kMaxAuras, false, &away));
   AUREOLE_RETURN_IF_ERROR(CheckColumn("away_owner", in.away_owner_size(), 1, away.size(), false));

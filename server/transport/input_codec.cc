@@ -1,5 +1,6 @@
 #include "server/transport/input_codec.h"
 
+#include <algorithm>
 #include <cmath>
 #include <memory>
 #include <utility>
@@ -140,6 +141,33 @@ absl::Status Decode(const v1::NewBody& in, const std::shared_ptr<const Shape>& l
   return absl::OkStatus();
 }
 
+void Encode(const LayoutChange& change, v1::LayoutChange* out) {
+  out->set_epoch(change.epoch);
+  for (const Rect& r : change.regions) {
+    for (double edge : {r.min_x, r.max_x, r.min_z, r.max_z}) out->add_region(edge);
+  }
+  for (int rank : change.ranks) out->add_rank(static_cast<uint32_t>(rank));
+  for (RegionId r : change.members) out->add_member(static_cast<uint32_t>(r));
+}
+
+// That it is a layout, CheckLiveInput says.
+absl::Status Decode(const v1::LayoutChange& in, LayoutChange* out) {
+  constexpr int kMost = limits::kMaxRegions;
+  if (in.region_size() % 4 != 0 || in.region_size() > 4 * kMost) {
+    return Bad("layout.region", absl::StrCat("has ", in.region_size(), " values"));
+  }
+  if (in.rank_size() > kMost) return Bad("layout.rank", absl::StrCat("has ", in.rank_size(), " values"));
+  if (in.member_size() > kMost) return Bad("layout.member", absl::StrCat("has ", in.member_size(), " values"));
+  const auto number = [](uint32_t value) { return static_cast<int>(std::min<uint32_t>(value, kMost)); };
+  out->epoch = in.epoch();
+  for (int i = 0; i < in.region_size(); i += 4) {
+    out->regions.push_back({in.region(i), in.region(i + 1), in.region(i + 2), in.region(i + 3)});
+  }
+  for (uint32_t rank : in.rank()) out->ranks.push_back(number(rank));
+  for (uint32_t member : in.member()) out->members.push_back(number(member));
+  return absl::OkStatus();
+}
+
 bool HasUnknownFields(const google::protobuf::Message& message) {
   const google::protobuf::Reflection* r = message.GetReflection();
   if (!r->GetUnknownFields(message).empty()) return true;
@@ -163,6 +191,7 @@ void Encode(const Input& input, const Shape* last, v1::Input* out) {
   out->set_sequence(input.sequence);
   out->set_kind(static_cast<uint32_t>(input.kind));
   if (input.kind == Input::Kind::kSpawn) return Encode(*input.spawn, last, out->mutable_spawn());
+  if (input.kind == Input::Kind::kLayout) return Encode(*input.layout, out->mutable_layout());
   out->set_body(input.body);
   Encode(input.linear, out->mutable_linear());
   Encode(input.angular, out->mutable_angular());
@@ -178,7 +207,7 @@ void Encode(const Input& input, const Shape* last, v1::Input* out) {
 
 absl::Status Decode(const v1::Input& in, const std::shared_ptr<const Shape>& last, Input* out) {
   if (HasUnknownFields(in)) return absl::InvalidArgumentError("input: has fields that this version does not know");
-  if (in.kind() > static_cast<uint32_t>(Input::Kind::kVelocityChange)) return Bad("kind", "no such kind");
+  if (in.kind() > static_cast<uint32_t>(Input::Kind::kLayout)) return Bad("kind", "no such kind");
   out->source = in.source();
   out->sequence = in.sequence();
   out->kind = static_cast<Input::Kind>(in.kind());
@@ -186,6 +215,10 @@ absl::Status Decode(const v1::Input& in, const std::shared_ptr<const Shape>& las
     auto body = std::make_shared<BodySpec>();
     AUREOLE_RETURN_IF_ERROR(Decode(in.spawn(), last, body.get()));
     out->spawn = std::move(body);
+  } else if (out->kind == Input::Kind::kLayout) {
+    auto change = std::make_shared<LayoutChange>();
+    AUREOLE_RETURN_IF_ERROR(Decode(in.layout(), change.get()));
+    out->layout = std::move(change);
   } else {
     out->body = in.body();
     AUREOLE_RETURN_IF_ERROR(Decode("linear", in.linear(), &out->linear));
@@ -236,6 +269,7 @@ void RecordInputs(const std::vector<Input>& inputs, google::protobuf::RepeatedPt
 
 absl::Status ReadRecordedInput(const v1::Input& in, Input* out) {
   AUREOLE_RETURN_IF_ERROR(Decode(in, nullptr, out));
+  if (out->kind == Input::Kind::kLayout) return Bad("kind", "the layout changes nothing that is recorded");
   if (in.tick() < 1) return Bad("tick", "must be at least 1");
   out->tick = in.tick();
   if (out->kind != Input::Kind::kSpawn) return absl::OkStatus();

@@ -9,6 +9,8 @@
 namespace aureole {
 namespace {
 
+constexpr const char* kReserved = "must not be 2^64 - 1, which is the control plane's; choose another number";
+
 v1::WorldSpec NamesOf(const v1::WorldSpec& spec) {
   v1::WorldSpec out;
   *out.mutable_materials() = spec.materials();
@@ -29,6 +31,7 @@ int64_t HullPoints(const v1::Shape& shape) {
 
 void CheckNames(uint64_t client, uint64_t sequence, int64_t inputs, SpecCheck* check) {
   if (client == 0) check->Fail(Path() / "client", "must be given, and not be 0", v1::MISSING);
+  if (client == kControlSource) check->Fail(Path() / "client", kReserved);
   if (sequence == 0) check->Fail(Path() / "sequence", "must be at least 1", v1::MISSING);
   if (sequence > ~uint64_t{0} - static_cast<uint64_t>(inputs)) {
     check->Fail(Path() / "sequence", "must leave room for those of all bodies");
@@ -48,6 +51,7 @@ ImpulseInputs ReadBatch(const InputScene& scene, const Path& path, const v1::Imp
   ImpulseInputs out;
   out.client = client == 0 ? batch.client() : client;
   if (out.client == 0) check.Fail(path / "client", "must be given in the first batch, and not be 0", v1::MISSING);
+  if (out.client == kControlSource) check.Fail(path / "client", kReserved);
   if (batch.client() != 0 && batch.client() != out.client) {
     check.Fail(path / "client", "must not change within a stream", v1::CONFLICT);
   }

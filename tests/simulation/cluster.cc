@@ -1,6 +1,8 @@
 #include "tests/simulation/cluster.h"
 
 #include <algorithm>
+#include <deque>
+#include <limits>
 #include <map>
 #include <memory>
 #include <optional>
@@ -13,6 +15,7 @@
 #include "server/core/check.h"
 #include "server/core/input_schedule.h"
 #include "server/core/region.h"
+#include "tests/simulation/layouts.h"
 #include "tests/simulation/network.h"
 
 namespace aureole::sim {
@@ -27,6 +30,7 @@ class Run {
         make_engine_(make_engine),
         rng_(seed ^ 0xfa17),
         crash_rng_(seed ^ 0xdead),
+        layout_rng_(seed ^ 0x1a70),
         network_(world_.layout.size(), seed, faults),
         reference_(make_engine(world_.environment)) {
     for (const BodySpec& b : world_.bodies) reference_->Spawn(b);
@@ -34,6 +38,8 @@ class Run {
     const int n = world_.layout.size();
     stalled_.resize(n);
     lives_.resize(static_cast<size_t>(n));
+    if (faults_.layouts && world_.exchange.k == 0) control_.changes = 1 + layout_rng_.Below(4);
+    control_.next = 1 + layout_rng_.Below(20);
     std::map<uint64_t, Client> clients;
     for (const Input& i : s_.live) clients[i.source].inputs.push_back(i);
     for (auto& [source, client] : clients) {
@@ -50,11 +56,14 @@ class Run {
     while (verdict_.ok && checked_ < s_.ticks) {
       const bool more = network_.RunNext(
           [this](RegionId to, const Frame& f) {
+            // A region that has left says all again after a crash, to those too that no longer know it.
+            if (f.tick <= regions_[to]->tick() && !StateOf(*regions_[to]).IsMember(f.from)) return;
             const absl::Status s = regions_[to]->Receive(f);
             if (!s.ok()) Fail(f.tick, "receive", std::string(s.message()));
             RunRegion(to);
           },
           [this](RegionId r) {
+            if (!lives_[static_cast<size_t>(r)].exists) return;
             if (regions_[r] == nullptr) {
               Restart(r);
             } else {
@@ -62,6 +71,7 @@ class Run {
             }
             RunRegion(r);
           });
+      if (faults_.layouts) Drop();
       if (!more && checked_ < s_.ticks && verdict_.ok) Fail(checked_ + 1, "I5", "the regions wait for each other");
     }
     if (verdict_.ok) CheckOutcomes();
@@ -71,7 +81,8 @@ class Run {
 
  private:
   struct Tally {
-    int regions = 0;
+    size_t regions = 0, members = 0;
+    uint64_t epoch = 0;
     std::vector<BodyRecord> records;
   };
 
@@ -81,6 +92,13 @@ class Run {
     std::vector<Frame> out;
     while (verdict_.ok && !stalled_[r] && region.Ready()) {
       if (faults_.crashes && crash_rng_.Chance(0.003) && MayCrash()) return Crash(r);
+      if (region.phase() == Phase::kJoin) {
+        region.Advance(&out);
+        // Nobody hears more without it, so it begins where they are.
+        Life& life = lives_[static_cast<size_t>(r)];
+        if (!life.heard_before) life.heard_before = delivered_.size();
+        life.heard = *life.heard_before;
+      }
       if (region.phase() == Phase::kBegin) {
         if (region.tick() >= s_.ticks) return;
         if (faults_.crashes) Checkpoint(region);
@@ -102,7 +120,182 @@ class Run {
         const auto frame = std::make_shared<const Frame>(std::move(f));
         for (RegionId p : frame->to) network_.Send(r, p, frame);
       }
-      if (region.tick() > before) Record(region, region.tick(), true);
+      if (region.tick() > before) {
+        Record(region, region.tick(), true);
+        if (faults_.layouts) Control(region);
+      }
+    }
+  }
+
+  // ---- the control plane ----
+
+  // Decides after each new tick of any region.
+  void Control(const Region& region) {
+    Life& life = lives_[static_cast<size_t>(region.self())];
+    if (region.tick() <= life.controlled) return;
+    life.controlled = region.tick();
+    if (region.phase() == Phase::kLeft) {
+      life.left = true;
+      MoveClients(region);
+    }
+    const bool adopted = control_.offered && region.layout_epoch() == control_.epoch;
+    if (adopted) {
+      ++verdict_.layouts;
+      control_.offered = false;
+      control_.next = region.tick() + 1 + layout_rng_.Below(20);
+      if (control_.emptying == kNoRegion) --control_.changes;
+      if (control_.emptying != kNoRegion && control_.dropping) {
+        control_.emptying = kNoRegion;
+        --control_.changes;
+      }
+      if (control_.emptying != kNoRegion) control_.next = region.tick() + (layout_rng_.Chance(0.3) ? 0 : 60);
+      control_.since = region.tick();
+    }
+    if (control_.offered || control_.changes == 0 || region.phase() == Phase::kLeft) return;
+    if (control_.emptying != kNoRegion) return FinishRemoval(region);
+    if (region.tick() >= control_.next) StartChange(region);
+  }
+
+  static Division::State StateOf(const Region& region) {
+    return {region.layout(), region.layout_epoch(), region.members()};
+  }
+
+  void StartChange(const Region& region) {
+    const Division::State now = StateOf(region);
+    std::vector<RegionId> with_area;
+    for (RegionId r : now.members) {
+      if (now.layout.has_area(r)) with_area.push_back(r);
+    }
+    const int kind = layout_rng_.Below(3);
+    if (kind == 0) {
+      Offer(region, MoveBorders(now, layout_rng_));
+      // Somebody else asks for another at about the same time: one of the two comes to nothing.
+      if (layout_rng_.Chance(0.3)) Offer(region, MoveBorders(now, layout_rng_));
+    } else if (kind == 1 || with_area.size() < 2) {
+      const LayoutChange change = AddRegion(now, NewRegion(), layout_rng_);
+      if (layout_rng_.Chance(0.3)) {
+        LayoutChange bad = change;
+        bad.epoch += static_cast<uint64_t>(layout_rng_.Below(2)) * 2 - 1;
+        Offer(region, bad);
+      }
+      for (RegionId r : change.members) {
+        if (!now.IsMember(r)) Create(r, change);
+      }
+      Offer(region, change);
+    } else {
+      control_.emptying = with_area[layout_rng_.Below(static_cast<int>(with_area.size()))];
+      control_.dropping = false;
+      Offer(region, TakeArea(now, control_.emptying, layout_rng_));
+    }
+  }
+
+  // Of the region that has no area any more. Now and then it is told to leave before it can.
+  void FinishRemoval(const Region& region) {
+    if (region.self() == control_.emptying && region.bodies() > 0 && region.tick() > control_.since + 100) {
+      return Fail(
+          region.tick(), "layout",
+          absl::StrCat("region ", region.self(), " has no area, and after 100 ticks ", region.bodies(), " bodies"));
+    }
+    const bool empty = region.self() == control_.emptying && region.bodies() == 0;
+    if (!empty && region.tick() < control_.next) return;
+    control_.next = std::numeric_limits<Tick>::max();
+    control_.dropping = true;
+    Offer(region, DropRegion(StateOf(region), control_.emptying));
+  }
+
+  // One that never was, or one that has left, whose name is free again.
+  RegionId NewRegion() {
+    for (size_t r = 0; r < lives_.size(); ++r) {
+      // (A checkpoint of somebody may still tell of the one before.)
+      if (!lives_[r].exists && !faults_.crashes && layout_rng_.Chance(0.7)) return static_cast<RegionId>(r);
+    }
+    return static_cast<RegionId>(regions_.size());
+  }
+
+  void Create(RegionId r, const LayoutChange& change) {
+    const auto index = static_cast<size_t>(r);
+    if (index == regions_.size()) {
+      regions_.emplace_back();
+      lives_.emplace_back();
+      stalled_.push_back(false);
+    }
+    lives_[index] = {};
+    lives_[index].joins = change;
+    regions_[index] = Join(r);
+    network_.Add(r);
+    ++verdict_.joined;
+  }
+
+  std::unique_ptr<Region> Join(RegionId r) {
+    absl::StatusOr<std::unique_ptr<Region>> region =
+        Region::Join(world_, r, make_engine_(world_.environment), *lives_[static_cast<size_t>(r)].joins);
+    AUREOLE_CHECK(region.ok(), "%s", std::string(region.status().message()).c_str());
+    return *std::move(region);
+  }
+
+  void Offer(const Region& region, LayoutChange change) {
+    Input input;
+    input.source = kControlSource;
+    input.sequence = ++control_.sequence;
+    input.kind = Input::Kind::kLayout;
+    control_.epoch = change.epoch;
+    control_.offered = true;
+    input.layout = std::make_shared<const LayoutChange>(std::move(change));
+    control_.waiting.emplace(AnyMember(region, layout_rng_), input);
+  }
+
+  // A change that came to nothing may be asked for again.
+  void HearOfLayout(const InputOutcome& outcome) {
+    if (outcome.refused.empty()) return;
+    ++verdict_.refused_layouts;
+    if (outcome.name.second != control_.sequence || !control_.offered || !control_.dropping) return;
+    control_.offered = false;
+    control_.next = std::numeric_limits<Tick>::max();
+  }
+
+  // As far as `region` knows; others may know that it has left.
+  RegionId AnyMember(const Region& region, Random& rng) const {
+    const std::vector<RegionId>& all = region.members();
+    const RegionId r = all[rng.Below(static_cast<int>(all.size()))];
+    return lives_[static_cast<size_t>(r)].left ? region.self() : r;
+  }
+
+  // Regions that have left are there until nobody can need a frame of theirs again.
+  void Drop() {
+    for (size_t r = 0; r < regions_.size(); ++r) {
+      if (regions_[r] == nullptr || regions_[r]->phase() != Phase::kLeft) continue;
+      const Tick last = regions_[r]->tick();
+      bool needed = false;
+      for (size_t other = 0; other < regions_.size(); ++other) {
+        if (other == r || !lives_[other].exists) continue;
+        const Tick back = faults_.crashes                            ? lives_[other].durable.tick
+                          : regions_[other]->phase() == Phase::kJoin ? last
+                                                                     : regions_[other]->tick();
+        needed |= back < last;
+      }
+      if (needed) continue;
+      network_.Remove(static_cast<RegionId>(r));
+      regions_[r] = nullptr;
+      lives_[r].exists = false;
+      ++verdict_.left;
+    }
+  }
+
+  // They go elsewhere, and say all again there.
+  void MoveClients(const Region& left) {
+    const std::vector<RegionId> to = left.next_members().empty() ? left.members() : left.next_members();
+    for (Client& client : clients_) {
+      if (client.region != left.self()) continue;
+      client.region = to[layout_rng_.Below(static_cast<int>(to.size()))];
+      client.next = 0;
+    }
+    for (auto it = control_.waiting.begin(); it != control_.waiting.end();) {
+      if (it->first == left.self()) {
+        control_.waiting.emplace(to.front(), it->second);
+        it = control_.waiting.erase(it);
+      } else {
+        ++it;
+      }
     }
   }
 
@@ -139,17 +332,27 @@ class Run {
         client.said = std::max(client.said, client.next + 1);
       }
       if (client.said == 0 || !rng_.Chance(0.02)) continue;
-      client.region = static_cast<RegionId>(rng_.Below(static_cast<int>(regions_.size())));
+      client.region = AnyMember(region, rng_);
       client.next = 0;
+    }
+    for (auto [i, end] = control_.waiting.equal_range(region.self()); i != end; i = control_.waiting.erase(i)) {
+      if (!Submit(region, i->second)) return;
+      lives_[static_cast<size_t>(region.self())].log.emplace(region.tick(), i->second);
     }
   }
 
   // Two at once at most.
-  bool MayCrash() const { return verdict_.crashes < 8 && std::count(regions_.begin(), regions_.end(), nullptr) < 2; }
+  bool MayCrash() const { return verdict_.crashes < 8 && Dead() < 2; }
+
+  int64_t Dead() const {
+    int64_t dead = 0;
+    for (size_t r = 0; r < regions_.size(); ++r) dead += lives_[r].exists && regions_[r] == nullptr;
+    return dead;
+  }
 
   void Crash(RegionId r) {
     ++verdict_.crashes;
-    verdict_.together += std::count(regions_.begin(), regions_.end(), nullptr);
+    verdict_.together += Dead();
     regions_[r] = nullptr;
     stalled_[r] = false;
     network_.Down(r);
@@ -179,11 +382,7 @@ class Run {
     life.writing.reset();
     std::unique_ptr<Engine> engine = make_engine_(world_.environment);
     if (life.durable.state.empty()) {
-      regions_[r] = std::make_unique<Region>(world_, r, std::move(engine));
-      for (RegionId peer : regions_[r]->peers()) {
-        life.durable.taken[peer] = 0;
-        life.durable.senders[peer] = {};
-      }
+      regions_[r] = life.joins ? Join(r) : std::make_unique<Region>(world_, r, std::move(engine));
     } else {
       absl::StatusOr<std::unique_ptr<Region>> region = Region::Load(world_, r, std::move(engine), life.durable.state);
       AUREOLE_CHECK(region.ok(), "%s", std::string(region.status().message()).c_str());
@@ -210,7 +409,13 @@ class Run {
                                  " where others were told another"));
       }
     }
-    for (const InputOutcome& o : region.TakeOutcomes()) outcomes_.push_back(o);
+    for (const InputOutcome& o : region.TakeOutcomes()) {
+      if (o.name.first == kControlSource) {
+        HearOfLayout(o);
+      } else {
+        outcomes_.push_back(o);
+      }
+    }
   }
 
   // Every input has one outcome, however often it was said, and it is that of the undivided world.
@@ -238,7 +443,11 @@ class Run {
   void Record(const Region& region, Tick n, bool stepped) {
     std::vector<BodyRecord> records;
     region.Observe(&records);
-    uint64_t hash = records.size();
+    const auto layout = layouts_.emplace(region.layout_epoch(), region.layout()).first;
+    if (layout->second != region.layout()) {
+      return Fail(n, "layout", absl::StrCat("region ", region.self(), " has another of epoch ", layout->first));
+    }
+    uint64_t hash = records.size() + 1000003 * region.layout_epoch();
     for (const BodyRecord& r : records) hash += BodyHash(r.id, r.hash) * (2 * static_cast<uint64_t>(r.epoch) + 1);
     Life& life = lives_[static_cast<size_t>(region.self())];
     const auto [before, fresh] = (stepped ? life.after_step : life.before_step).emplace(n, hash);
@@ -246,14 +455,35 @@ class Run {
       if (before->second == hash) return;
       return Fail(n, "replay", absl::StrCat("region ", region.self(), " differs from before it died"));
     }
-    std::map<Tick, Tally>* const tallies = stepped ? &after_step_ : &before_step_;
-    const auto check = stepped ? &Run::CheckAfterStep : &Run::CheckBeforeStep;
-    Tally& t = (*tallies)[n];
+    Tally& t = (stepped ? after_step_ : before_step_)[n];
     t.records.insert(t.records.end(), records.begin(), records.end());
-    if (++t.regions < static_cast<int>(regions_.size())) return;
+    if (t.regions++ == 0) t.epoch = region.layout_epoch();
+    if (t.epoch != region.layout_epoch()) {
+      return Fail(n, "layout",
+                  absl::StrCat("region ", region.self(), " has that of epoch ", region.layout_epoch(),
+                               ", others have that of epoch ", t.epoch));
+    }
+    t.members = region.members().size();
+    while (verdict_.ok && CheckNext()) {
+    }
+  }
+
+  // In order: a region that leaves may be slower in its last tick than the others are in the next.
+  bool CheckNext() {
+    std::map<Tick, Tally>& tallies = stepping_ ? after_step_ : before_step_;
+    const Tick n = checked_ + 1;
+    const auto it = tallies.find(n);
+    if (it == tallies.end() || it->second.regions < it->second.members) return false;
+    Tally& t = it->second;
     std::sort(t.records.begin(), t.records.end(), [](const BodyRecord& x, const BodyRecord& y) { return x.id < y.id; });
-    (this->*check)(n, t);
-    tallies->erase(n);
+    if (stepping_) {
+      CheckAfterStep(n, t);
+    } else {
+      CheckBeforeStep(n, t);
+    }
+    stepping_ = !stepping_;
+    tallies.erase(it);
+    return true;
   }
 
   void Fail(Tick n, std::string invariant, std::string message) {
@@ -378,7 +608,7 @@ class Run {
   const World& world_;
   const Faults faults_;
   const EngineFactory& make_engine_;
-  Random rng_, crash_rng_;
+  Random rng_, crash_rng_, layout_rng_;
   Network network_;
   std::unique_ptr<Engine> reference_;
   std::vector<std::unique_ptr<Region>> regions_;
@@ -392,6 +622,11 @@ class Run {
     std::map<RegionId, uint64_t> taken;
   };
   struct Life {
+    bool exists = true;
+    std::optional<LayoutChange> joins;   // with which it came to be; none: it was there from the beginning
+    std::optional<size_t> heard_before;  // of delivered_, when it came
+    Tick controlled = 0;
+    bool left = false;
     Saved durable;                 // state: empty before the first
     std::optional<Saved> writing;  // durable from this tick on
     Tick durable_at = 0;
@@ -400,8 +635,19 @@ class Run {
     size_t heard = 0;                                  // of delivered_
     std::map<Tick, uint64_t> before_step, after_step;  // what it had, by tick
   };
-  std::vector<Life> lives_;  // by region
+  std::deque<Life> lives_;  // by region
   std::map<Tick, Tally> before_step_, after_step_;
+  std::map<uint64_t, Layout> layouts_;  // by epoch
+  struct {
+    int changes = 0;  // to come
+    Tick next = 0;    // when
+    uint64_t sequence = 0, epoch = 0;
+    bool offered = false;                    // a change to this epoch
+    RegionId emptying = kNoRegion;           // loses its area, then leaves
+    bool dropping = false;                   // it is to leave with the change that was offered
+    Tick since = 0;                          // when the last change came into force
+    std::multimap<RegionId, Input> waiting;  // to be offered to that region
+  } control_;
   InputSchedule accepted_;
   struct Client {
     std::vector<Input> inputs;
@@ -416,6 +662,7 @@ class Run {
   std::map<BodyId, bool> asleep_;
   std::map<BodyId, std::pair<int64_t, Epoch>> owned_;  // group and epoch when last seen
   Tick checked_ = 0;
+  bool stepping_ = false;  // the one after it is checked as far as its step
   Verdict verdict_;
 };
 

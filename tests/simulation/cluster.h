@@ -19,14 +19,17 @@ struct Faults {
   // One region, or two, lose all that they have in memory, between any two phases, and go on from their last
   // checkpoint.
   bool crashes = false;
+  // k = 0: now and then the layout changes: borders move, a region joins, or one loses its area and, when the last body
+  // has gone, leaves.
+  bool layouts = false;
 
-  static Faults None() { return {false, false, false, false, false, false}; }
+  static Faults None() { return {false, false, false, false, false, false, false}; }
 };
 
 struct Verdict {
   bool ok = true;
   Tick tick = 0;          // first bad tick
-  std::string invariant;  // "I1".. "I6", "live"
+  std::string invariant;  // "I1".. "I6", "inputs", "layout", ..
   std::string message;
 
   // What the seed went through.
@@ -37,6 +40,7 @@ struct Verdict {
   int64_t spawns = 0, live_inputs = 0;
   int64_t reconnects = 0, duplicates = 0, stalls = 0;
   int64_t crashes = 0, replayed_ticks = 0, together = 0;  // together: died while another was dead
+  int64_t layouts = 0, joined = 0, left = 0, refused_layouts = 0;
   int64_t violations = 0;
   int64_t home_crossings = 0, away_body_ticks = 0, body_ticks = 0;
   uint64_t hash = 0;  // of the last state

@@ -22,6 +22,7 @@ struct Totals {
   int64_t transfers = 0, touching = 0, returns = 0, wakes = 0, spawns = 0, live = 0;
   int64_t reconnects = 0, duplicates = 0, stalls = 0, violations = 0, graphs_again = 0;
   int64_t crashes = 0, replayed = 0, together = 0;
+  int64_t layouts = 0, joined = 0, left = 0, refused_layouts = 0;
   int64_t largest_cluster = 0;
   std::map<int64_t, int64_t> chains;  // longest chain -> seeds
   std::map<std::string, int64_t> kinds;
@@ -49,6 +50,10 @@ void Add(const Scenario& s, const Verdict& v, Totals* t) {
   t->crashes += v.crashes;
   t->replayed += v.replayed_ticks;
   t->together += v.together;
+  t->layouts += v.layouts;
+  t->joined += v.joined;
+  t->left += v.left;
+  t->refused_layouts += v.refused_layouts;
   t->violations += v.violations;
   t->graphs_again += v.graphs_again;
   t->largest_cluster = std::max(t->largest_cluster, v.largest_cluster);
@@ -126,20 +131,25 @@ int RunAll(const Options& o) {
                 static_cast<long long>(totals.crashes), static_cast<long long>(totals.together),
                 static_cast<long long>(totals.replayed));
   }
+  if (o.faults.layouts) {
+    std::printf("  layouts %lld, regions joined %lld, left %lld; layouts refused %lld\n",
+                static_cast<long long>(totals.layouts), static_cast<long long>(totals.joined),
+                static_cast<long long>(totals.left), static_cast<long long>(totals.refused_layouts));
+  }
   std::printf("  hash %016llx\n", static_cast<unsigned long long>(totals.hash));
   return totals.bad == 0 ? 0 : 1;
 }
 
 bool ParseFaults(const std::string& list, Faults* f) {
   if (list == "all") {
-    f->crashes = true;
+    f->crashes = f->layouts = true;
     return true;
   }
   *f = Faults::None();
   if (list == "none") return true;
-  const std::map<std::string, bool*> names{{"delay", &f->delay},           {"jitter", &f->jitter},
-                                           {"duplicates", &f->duplicates}, {"reconnects", &f->reconnects},
-                                           {"stalls", &f->stalls},         {"crashes", &f->crashes}};
+  const std::map<std::string, bool*> names{
+      {"delay", &f->delay},   {"jitter", &f->jitter},   {"duplicates", &f->duplicates}, {"reconnects", &f->reconnects},
+      {"stalls", &f->stalls}, {"crashes", &f->crashes}, {"layouts", &f->layouts}};
   for (const std::string& name : CLI::detail::split(list, ',')) {
     auto it = names.find(name);
     if (it == names.end()) return false;
@@ -165,7 +175,8 @@ int Main(int argc, char** argv) {
   app.add_option("--seeds", o.seeds, "number of seeds")->check(CLI::PositiveNumber);
   app.add_option("--first", o.first, "first seed");
   app.add_flag("--toy", o.scenario.toy, "the toy engine instead of Bullet");
-  app.add_option("--faults", faults, "all, none, or a list of delay,jitter,duplicates,reconnects,stalls,crashes");
+  app.add_option("--faults", faults,
+                 "all, none, or a list of delay,jitter,duplicates,reconnects,stalls,crashes,layouts");
   app.add_option("--k", k, "delay of the exchange in ticks (default: by seed)")->check(CLI::Range(0, 3));
   app.add_option("--policy", policy, "tolerance or reach (default: by seed)")
       ->check(CLI::IsMember({"tolerance", "reach"}));

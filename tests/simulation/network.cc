@@ -7,9 +7,30 @@ namespace aureole::sim {
 Network::Network(int regions, uint64_t seed, const Faults& faults) : faults_(faults), rng_(seed ^ 0x5eed) {
   for (RegionId a = 0; a < regions; ++a) {
     for (RegionId b = 0; b < regions; ++b) {
-      if (a != b) links_[{a, b}].base_us = faults_.delay ? static_cast<int64_t>(rng_.In(100, 20000)) : 100;
+      if (a != b) AddLink(a, b);
     }
+    regions_.insert(a);
   }
+}
+
+void Network::AddLink(RegionId from, RegionId to) {
+  Link& link = links_[{from, to}];
+  link.base_us = faults_.delay ? static_cast<int64_t>(rng_.In(100, 20000)) : 100;
+  link.connection = ++links_made_ << 32;  // what was sent to a region of the same name before is not for this one
+}
+
+void Network::Add(RegionId region) {
+  for (RegionId other : regions_) {
+    AddLink(region, other);
+    AddLink(other, region);
+  }
+  regions_.insert(region);
+}
+
+void Network::Remove(RegionId region) {
+  regions_.erase(region);
+  down_.erase(region);
+  std::erase_if(links_, [region](const auto& l) { return l.first.first == region || l.first.second == region; });
 }
 
 void Network::Push(Event e) {
@@ -54,18 +75,22 @@ Network::Senders Network::SendersOf(RegionId region) const {
 
 void Network::Up(RegionId region, const Senders& senders, const std::map<RegionId, uint64_t>& taken) {
   down_.erase(region);
-  for (const auto& [peer, sender] : senders) {
-    links_.at({region, peer}).sender = sender;
+  for (RegionId peer : regions_) {
+    if (peer == region) continue;
+    const auto sender = senders.find(peer);
+    links_.at({region, peer}).sender = sender == senders.end() ? decltype(Link::sender)() : sender->second;
+    Link& back = links_.at({peer, region});
+    const auto frames = taken.find(peer);
+    back.receiver = LinkReceiver(frames == taken.end() ? back.sender.first() - 1 : frames->second);
     Reconnect(region, peer);
-  }
-  for (const auto& [peer, frames] : taken) {
-    links_.at({peer, region}).receiver = LinkReceiver(frames);
     Reconnect(peer, region);
   }
 }
 
 void Network::Durable(RegionId region, const std::map<RegionId, uint64_t>& taken) {
-  for (const auto& [peer, frames] : taken) links_.at({peer, region}).sender.Acknowledge(frames);
+  for (const auto& [peer, frames] : taken) {
+    if (const auto link = links_.find({peer, region}); link != links_.end()) link->second.sender.Acknowledge(frames);
+  }
 }
 
 void Network::Transmit(RegionId from, RegionId to, uint64_t sequence, const std::shared_ptr<const Frame>& frame) {
@@ -91,7 +116,9 @@ bool Network::RunNext(const std::function<void(RegionId, const Frame&)>& deliver
     wake(e.to);
     return true;
   }
-  Link& link = links_.at({e.from, e.to});
+  const auto found = links_.find({e.from, e.to});
+  if (found == links_.end()) return true;
+  Link& link = found->second;
   if (e.connection != link.connection || down_.contains(e.to) || down_.contains(e.from)) return true;  // lost
   if (e.kind == Event::Kind::kReconnect) {
     link.last_arrival_us = now_us_;

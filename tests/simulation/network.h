@@ -20,6 +20,10 @@ class Network {
  public:
   Network(int regions, uint64_t seed, const Faults& faults);
 
+  // A region that may speak with all others from now on; and one that will never again: what is under way is lost.
+  void Add(RegionId region);
+  void Remove(RegionId region);
+
   void Send(RegionId from, RegionId to, std::shared_ptr<const Frame> frame);
   // Runs `fn` for the region at a later time of its own choosing.
   void Wake(RegionId region, int64_t delay_us);
@@ -33,7 +37,8 @@ class Network {
   // Of a region: what it keeps for each peer.
   using Senders = std::map<RegionId, LinkSender<std::shared_ptr<const Frame>>>;
   Senders SendersOf(RegionId region) const;
-  // It is back: it goes on with what it kept then, and has taken so many frames of each peer.
+  // It is back: it goes on with what it kept then, and has taken so many frames of each peer. Of a
+  // peer that is not named, because it was none then, it has taken what it had said to be durable.
   void Up(RegionId region, const Senders& senders, const std::map<RegionId, uint64_t>& taken);
   // With crashes, frames are kept until the receiver says that they are durable there.
   void Durable(RegionId region, const std::map<RegionId, uint64_t>& taken);
@@ -62,8 +67,12 @@ class Network {
   void Reconnect(RegionId from, RegionId to);
   void Push(Event e);
 
+  void AddLink(RegionId from, RegionId to);
+
   Faults faults_;
   Random rng_;
+  std::set<RegionId> regions_;
+  uint64_t links_made_ = 0;
   std::map<std::pair<RegionId, RegionId>, Link> links_;
   std::set<RegionId> down_;
   std::priority_queue<Event, std::vector<Event>, std::greater<>> events_;
