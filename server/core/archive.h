@@ -4,6 +4,7 @@
 // where they can be damaged adds a check sum; the reader only takes care not to run over their end.
 #pragma once
 
+#include <algorithm>
 #include <array>
 #include <cstdint>
 #include <cstring>
@@ -141,9 +142,15 @@ class Writer {
   void Put(const std::multimap<K, V>& v) {
     PutAll(v);
   }
+  // Ascending, so that equal maps are equal bytes.
   template <class K, class V>
   void Put(const absl::flat_hash_map<K, V>& v) {
-    PutAll(v);
+    std::vector<const std::pair<const K, V>*> sorted;
+    sorted.reserve(v.size());
+    for (const auto& x : v) sorted.push_back(&x);
+    std::sort(sorted.begin(), sorted.end(), [](const auto* x, const auto* y) { return x->first < y->first; });
+    Put(v.size());
+    for (const auto* x : sorted) Put(*x);
   }
   template <class T>
   requires archive_internal::Member<T, Writer>

@@ -133,9 +133,11 @@ const std::vector<RegionId>& Region::next_members() const { return impl_->holdin
 absl::Status Region::Receive(Frame frame) {
   Holdings& h = impl_->holdings;
   const bool synchronous = h.world.exchange.k == 0, joins = phase() == Phase::kJoin;
-  // Null: of a tick whose layout nobody knows yet. Only a region that repeats what it had done hears of such a tick;
-  // when it comes there, the layout is known (Protocol).
-  const Division::State* division = synchronous && !joins ? h.division.At(frame.tick, h.tick) : &h.division.now();
+  // Null: of a tick whose layout is not known here. That is so in a region that repeats what it had done, and in one
+  // that waits for its welcome; when they come there, it is held against the layout (SyncExchange::Pop).
+  const Division::State* division = &h.division.now();
+  if (joins && frame.round != kWelcome) division = nullptr;
+  if (synchronous && !joins) division = h.division.At(frame.tick, h.tick);
   const bool peer = frame.from != h.self && (division != nullptr ? division->IsMember(frame.from)
                                                                  : frame.from >= 0 && frame.from < limits::kMaxRegions);
   if (!peer) {

@@ -22,12 +22,20 @@ class Lockstep {
     }
   }
 
-  // Until every region has stepped tick n.
+  // A region that joins with this change, once it is in force; and one that is there no more.
+  void Join(RegionId r, const LayoutChange& change) {
+    if (static_cast<size_t>(r) >= regions_.size()) regions_.resize(static_cast<size_t>(r) + 1);
+    regions_[r] = *Region::Join(world_, r, MakeToyEngine(world_.environment), change);
+  }
+  void Drop(RegionId r) { regions_[r] = nullptr; }
+
+  // Until every region has stepped tick n, but those that have left, or have not joined yet.
   void RunTo(Tick n) {
     bool progress = true;
     while (progress) {
       progress = false;
       for (auto& r : regions_) {
+        if (r == nullptr) continue;
         while (r->Ready() && !(r->phase() == Phase::kBegin && r->tick() >= n)) {
           Advance(*r);
           progress = true;
@@ -35,7 +43,7 @@ class Lockstep {
       }
     }
     for (auto& r : regions_) {
-      if (r->tick() != n) std::abort();
+      if (r != nullptr && r->phase() == Phase::kBegin && r->tick() != n) std::abort();
     }
   }
 
@@ -43,7 +51,7 @@ class Lockstep {
   RegionId Owner(BodyId id) const {
     RegionId owner = kNoRegion;
     for (const auto& r : regions_) {
-      if (r->engine().Contains(id)) owner = owner == kNoRegion ? r->self() : -100;
+      if (r != nullptr && r->engine().Contains(id)) owner = owner == kNoRegion ? r->self() : -100;
     }
     return owner;
   }
@@ -51,12 +59,12 @@ class Lockstep {
   const World& world() const { return world_; }
   int64_t BodiesMoved() const {
     int64_t n = 0;
-    for (const auto& r : regions_) n += r->stats().bodies_out;
+    for (const auto& r : regions_) n += r == nullptr ? 0 : r->stats().bodies_out;
     return n;
   }
   uint64_t Hash() const {
     uint64_t sum = 0;
-    for (const auto& r : regions_) sum += r->StateHash();
+    for (const auto& r : regions_) sum += r == nullptr ? 0 : r->StateHash();
     return sum;
   }
   // Frames of the last tick, by (from, to).

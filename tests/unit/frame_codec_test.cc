@@ -41,7 +41,7 @@ Input Force() {
 
 Input Explosion() {
   Input input;
-  input.source = ~0ull;
+  input.source = ~1ull;
   input.sequence = 2;
   input.kind = Input::Kind::kVelocityChange;
   input.area = {{0.1, 0.2, 0.3}, 7.7, -0.1, true};
@@ -74,6 +74,21 @@ Input Spawn() {
   return input;
 }
 
+Input NewLayout() {
+  constexpr double kInf = std::numeric_limits<double>::infinity();
+  auto change = std::make_shared<LayoutChange>();
+  change->epoch = 7;
+  change->regions = {{-kInf, 0.1, -kInf, kInf}, {}, {0.1, kInf, -kInf, -0.0}, {0.1, kInf, -0.0, kInf}};
+  change->ranks = {3, 1, 0, 2};
+  change->members = {0, 2, 3};
+  Input input;
+  input.source = kControlSource;
+  input.sequence = 5;
+  input.kind = Input::Kind::kLayout;
+  input.layout = change;
+  return input;
+}
+
 Frame MakeFrame(bool predicted) {
   Frame f;
   f.from = 1;
@@ -103,10 +118,13 @@ Frame MakeFrame(bool predicted) {
   g.inputs.push_back(Force());
   g.inputs.push_back(Explosion());
   g.inputs.push_back(Spawn());
+  g.inputs.push_back(NewLayout());
   g.applied = {{{4, 16}, 1}, {{~0ull, 1}, 3}};
   f.graphs[1].of = 3;
   f.graphs[1].opened = {0, 7};
   f.graphs[1].closed = {2};
+  f.graphs[1].emptied = true;
+  f.welcome = std::string("\0\xff welcome", 10);
   Transfer t;
   t.ids = {11, 1ull << 62};
   t.epochs = {0, 4000000000u};
@@ -179,10 +197,13 @@ void ExpectSame(const Graph& a, const Graph& b) {
     EXPECT_TRUE(p.area.outward == q.area.outward && p.area.fades == q.area.fades);
     ASSERT_EQ(p.spawn != nullptr, q.spawn != nullptr);
     if (p.spawn != nullptr) ExpectSame(*p.spawn, *q.spawn);
+    ASSERT_EQ(p.layout == nullptr, q.layout == nullptr);
+    EXPECT_TRUE(p.layout == nullptr || *p.layout == *q.layout);
   }
   EXPECT_EQ(a.applied, b.applied);
   EXPECT_EQ(a.opened, b.opened);
   EXPECT_EQ(a.closed, b.closed);
+  EXPECT_EQ(a.emptied, b.emptied);
 }
 
 void ExpectSame(const Frame& a, const Frame& b) {
@@ -210,6 +231,7 @@ void ExpectSame(const Frame& a, const Frame& b) {
   }
   EXPECT_EQ(a.away, b.away);
   EXPECT_EQ(a.away_gone, b.away_gone);
+  EXPECT_EQ(a.welcome, b.welcome);
 }
 
 absl::Status Refusal(const v1::Frame& frame) { return DecodeFrame(frame.SerializeAsString(), 0, 1).status(); }
@@ -305,7 +327,7 @@ TEST(FrameCodec, RefusesWhatNoRegionSends) {
   refused("frame.transfer.state", [](v1::Frame* f) { f->mutable_transfer(0)->clear_state(); });
   refused("frame.transfer.spawn_tick", [](v1::Frame* f) { f->mutable_transfer(0)->add_spawn_tick(1); });
   refused("frame.transfer.spawn_body", [](v1::Frame* f) { f->mutable_transfer(0)->set_spawn_body(0, 0); });
-  refused("frame.graph.input.kind", [](v1::Frame* f) { f->mutable_graph(0)->mutable_input(0)->set_kind(6); });
+  refused("frame.graph.input.kind", [](v1::Frame* f) { f->mutable_graph(0)->mutable_input(0)->set_kind(7); });
   refused("frame.graph.input.ticks", [](v1::Frame* f) { f->mutable_graph(0)->mutable_input(0)->set_ticks(2); });
   refused("frame.graph.input.point", [](v1::Frame* f) { f->mutable_graph(0)->mutable_input(2)->add_point(1); });
   refused("frame.graph.input.frame", [](v1::Frame* f) { f->mutable_graph(0)->mutable_input(2)->set_frame(3); });
@@ -327,6 +349,20 @@ TEST(FrameCodec, RefusesWhatNoRegionSends) {
           [&](v1::Frame* f) { spawn(f)->mutable_shape()->mutable_children(0)->mutable_shape()->set_radius(-1); });
   refused("frame.graph.input.spawn.shape.points",
           [&](v1::Frame* f) { spawn(f)->mutable_shape()->mutable_children(1)->mutable_shape()->add_points(1); });
+  const auto layout = [](v1::Frame* f) { return f->mutable_graph(0)->mutable_input(5)->mutable_layout(); };
+  refused("frame.graph.input.source", [&](v1::Frame* f) { f->mutable_graph(0)->mutable_input(5)->set_source(5); });
+  refused("frame.graph.input.source",
+          [&](v1::Frame* f) { f->mutable_graph(0)->mutable_input(0)->set_source(kControlSource); });
+  refused("frame.graph.input.layout.region", [&](v1::Frame* f) { layout(f)->add_region(1); });
+  refused("frame.graph.input.layout.regions[3]", [&](v1::Frame* f) { layout(f)->set_region(12, NAN); });
+  refused("none covers", [&](v1::Frame* f) { layout(f)->set_region(1, 0.05); });
+  refused("overlaps", [&](v1::Frame* f) { layout(f)->set_region(1, 0.2); });
+  refused("frame.graph.input.layout.ranks", [&](v1::Frame* f) { layout(f)->set_rank(0, ~0u); });
+  refused("frame.graph.input.layout.rank", [&](v1::Frame* f) {
+    for (int i = 0; i < 100; ++i) layout(f)->add_rank(0);
+  });
+  refused("frame.graph.input.layout.members", [&](v1::Frame* f) { layout(f)->set_member(2, ~0u); });
+  refused("frame.graph.input.layout.members", [&](v1::Frame* f) { layout(f)->clear_member(); });
   refused("frame.graph.applied_bodies", [](v1::Frame* f) { f->mutable_graph(0)->set_applied_bodies(0, 0); });
   refused("frame.graph.input", [](v1::Frame* f) { f->mutable_graph(0)->mutable_input(0)->set_source(0); });
   refused("frame.graph.input.linear", [](v1::Frame* f) { f->mutable_graph(0)->mutable_input(0)->set_linear(1, NAN); });
