@@ -240,7 +240,9 @@ class Reader {
     Get(there);
     if (!there) return v.reset();
     auto value = std::make_shared<std::remove_const_t<T>>();
-    Get(*value);
+    if (++depth_ > kMostDepth) ok_ = false;
+    if (ok_) Get(*value);
+    --depth_;
     v = std::move(value);
   }
   template <class T>
@@ -292,8 +294,11 @@ class Reader {
   template <class T>
   requires(std::is_class_v<T> && !archive_internal::Member<T, Reader>) void Get(T& v) { Visit(*this, v); }
 
+  static constexpr int kMostDepth = 16;  // of what points to its own kind
+
   std::string_view left_;
   bool ok_ = true;
+  int depth_ = 0;
 };
 
 }  // namespace aureole

@@ -8,6 +8,7 @@
 #include <filesystem>
 #include <fstream>
 #include <functional>
+#include <limits>
 #include <memory>
 #include <string>
 #include <vector>
@@ -19,6 +20,7 @@
 #include "client/cli/mcap_writer.h"
 #include "client/cli/recording.h"
 #include "client/src/replica_decoder.h"
+#include "server/core/region.h"
 #include "server/physics/bullet_engine.h"
 #include "server/replay/replay.h"
 #include "server/transport/frame_codec.h"
@@ -204,6 +206,51 @@ TEST(FuzzMessage, CastRaysRequest) {
   EXPECT_GT(taken, 100);
 }
 
+LayoutChange HalfPlanes() {
+  constexpr double kInf = std::numeric_limits<double>::infinity();
+  return {2, {{-kInf, 0, -kInf, kInf}, {0, kInf, -kInf, kInf}}, {0, 1}, {0, 1}};
+}
+
+// What a region is told when it joins is refused, or is of the layout with which it joins.
+TEST(FuzzMessage, Welcome) {
+  const World world(*Layout::Columns({}));
+  LiveInputs live;
+  Input drop;
+  drop.source = 4;
+  drop.sequence = 1;
+  drop.kind = Input::Kind::kSpawn;
+  auto body = std::make_shared<BodySpec>();
+  body->shape = std::make_shared<Shape>();
+  drop.spawn = body;
+  live.Deliver({drop}, 5, 5, true);
+  std::string seed;
+  Writer writer(&seed);
+  writer(Division(HalfPlanes()));
+  live.Teach(writer);
+  sim::Random random(7);
+  int taken = 0;
+  for (int round = 0; round < kRounds; ++round) {
+    Frame frame;
+    frame.from = 0;
+    frame.to = {1};
+    frame.tick = 4;
+    frame.round = kWelcome;
+    frame.welcome = seed;
+    if (round > 0) fuzz::Mutate(&frame.welcome, &random);
+    const auto region = *Region::Join(world, 1, MakeBulletEngine(world.environment), HalfPlanes());
+    if (!region->Receive(frame).ok()) {
+      EXPECT_GT(round, 0);
+      continue;
+    }
+    ++taken;
+    std::vector<Frame> out;
+    region->Advance(&out);
+    EXPECT_EQ(region->phase(), Phase::kBegin);
+    EXPECT_EQ(region->layout_epoch(), 2u);
+  }
+  EXPECT_GT(taken, 10);
+}
+
 TEST(FuzzMessage, PeerFrame) {
   Frame frame;
   frame.from = 1;
@@ -218,7 +265,14 @@ TEST(FuzzMessage, PeerFrame) {
   kick.source = 9;
   kick.sequence = 2;
   kick.body = 3;
-  graph.inputs = {kick};
+  Input layout;
+  layout.source = kControlSource;
+  layout.sequence = 1;
+  layout.kind = Input::Kind::kLayout;
+  layout.layout = std::make_shared<const LayoutChange>(HalfPlanes());
+  graph.inputs = {kick, layout};
+  graph.emptied = true;
+  frame.welcome = "welcome";
   frame.graphs = {graph};
   Transfer transfer;
   transfer.ids = {3, 4};

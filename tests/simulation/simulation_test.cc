@@ -12,6 +12,7 @@ namespace {
 struct Sum {
   int64_t bad = 0, touching = 0, chains_of_3 = 0, chains_of_4 = 0, wakes = 0, returns = 0, reconnects = 0;
   int64_t graphs_again = 0, crashes = 0, replayed = 0, together = 0;
+  int64_t layouts = 0, joined = 0, left = 0, refused_layouts = 0;
   std::string first;
 };
 Sum RunSeeds(uint64_t first, int seeds, const ScenarioOptions& options, const Faults& faults, bool stop = true,
@@ -31,6 +32,10 @@ Sum RunSeeds(uint64_t first, int seeds, const ScenarioOptions& options, const Fa
     sum.crashes += v.crashes;
     sum.replayed += v.replayed_ticks;
     sum.together += v.together;
+    sum.layouts += v.layouts;
+    sum.joined += v.joined;
+    sum.left += v.left;
+    sum.refused_layouts += v.refused_layouts;
     if (!v.ok) {
       sum.first =
           "seed " + std::to_string(seed) + " tick " + std::to_string(v.tick) + " " + v.invariant + ": " + v.message;
@@ -117,6 +122,51 @@ TEST(ClusterSimulation, BulletRegionsThatDieGoOnBitForBit) {
   const Sum sum = RunSeeds(21000, 12, {}, faults, true, MakeBulletEngine);
   EXPECT_EQ(sum.bad, 0) << sum.first;
   EXPECT_GT(sum.crashes, 40);
+}
+
+// Borders move, regions join and leave, under all that the network does and while regions die: no bit changes.
+TEST(ClusterSimulation, TheLayoutOfARunningWorldChangesBitForBit) {
+  ScenarioOptions options;
+  options.k = 0;
+  Faults faults;
+  faults.layouts = true;
+  for (const bool crashes : {false, true}) {
+    faults.crashes = crashes;
+    const Sum sum = RunSeeds(30000, 300, options, faults);
+    EXPECT_EQ(sum.bad, 0) << sum.first;
+    EXPECT_GT(sum.layouts, 800);
+    EXPECT_GT(sum.joined, 200);
+    EXPECT_GT(sum.left, 150);
+    EXPECT_GT(sum.refused_layouts, 50);
+  }
+}
+
+TEST(ClusterSimulation, TheLayoutOfABulletWorldChangesBitForBit) {
+  ScenarioOptions options;
+  options.k = 0;
+  Faults faults;
+  faults.layouts = faults.crashes = true;
+  const Sum sum = RunSeeds(31000, 12, options, faults, true, MakeBulletEngine);
+  EXPECT_EQ(sum.bad, 0) << sum.first;
+  EXPECT_GT(sum.layouts, 20);
+}
+
+// Without live inputs, whose tick depends on the layout only as it does on the network.
+TEST(ClusterSimulation, ChangesOfTheLayoutChangeNoBitOfTheLastState) {
+  Faults layouts = Faults::None();
+  layouts.layouts = true;
+  ScenarioOptions options;
+  options.k = 0;
+  int64_t changed = 0;
+  for (uint64_t seed = 1; seed <= 60; ++seed) {
+    const Scenario s = MakeScenario(seed, options, MakeToyEngine);
+    if (!s.live.empty()) continue;
+    const Verdict fixed = RunCluster(s, seed, Faults::None(), MakeToyEngine);
+    const Verdict moving = RunCluster(s, seed, layouts, MakeToyEngine);
+    EXPECT_EQ(fixed.hash, moving.hash) << "seed " << seed;
+    changed += moving.layouts;
+  }
+  EXPECT_GT(changed, 80);
 }
 
 // Where three regions lie side by side, strangers of the outer two meet deep in the middle one: m = 2 is not enough on
