@@ -5,6 +5,7 @@
 
 #include <absl/strings/str_cat.h>
 
+#include "server/core/check.h"
 #include "server/core/limits.h"
 
 namespace aureole {
@@ -84,12 +85,13 @@ absl::Status Division::Deliver(const LayoutChange& change, Tick effect) {
   return absl::OkStatus();
 }
 
-bool Division::Adopt(Tick n) {
-  if (next_at_ == 0 || n < next_at_) return false;
+void Division::Adopt(Tick n) {
+  AUREOLE_CHECK(n == next_at_, "layout of epoch %llu, of tick %lld, adopted at tick %lld",
+                static_cast<unsigned long long>(next_.epoch), static_cast<long long>(next_at_),
+                static_cast<long long>(n));
   now_ = next_;
   next_at_ = 0;
   std::erase_if(emptied_, [this](RegionId r) { return !now_.IsMember(r) || now_.layout.has_area(r); });
-  return true;
 }
 
 }  // namespace aureole

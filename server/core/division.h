@@ -55,8 +55,8 @@ class Division {
   // The rest is called alike in all regions. A change that takes effect at the start of tick `effect`, or has no
   // effect: FailedPrecondition says why. Precondition: LayoutOf(change).ok().
   absl::Status Deliver(const LayoutChange& change, Tick effect);
-  // At the start of tick n: true when now() has changed.
-  bool Adopt(Tick n);
+  // Precondition: n is next_at(), the tick that begins.
+  void Adopt(Tick n);
   // A member without area has no bodies, and will get none: it may be left out of the next layout.
   void Emptied(RegionId region) { emptied_.insert(region); }
   bool IsEmptied(RegionId region) const { return emptied_.contains(region); }

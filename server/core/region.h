@@ -127,7 +127,7 @@ class Region {
   Phase phase() const;
   // Every region this one may exchange frames with, ascending: all other members.
   const std::vector<RegionId>& peers() const;
-  // What is in force in the tick that has begun, or at kBegin in the one that was stepped.
+  // What is in force in the tick that has begun, or at kBegin in the one that was stepped; at kJoin what will be then.
   const Layout& layout() const;
   uint64_t layout_epoch() const;
   const std::vector<RegionId>& members() const;
@@ -153,6 +153,8 @@ class Region {
   // been taken before, here or elsewhere, and acts only once. InvalidArgument names the field; then nothing changes.
   // A change of the layout (source kControlSource; k = 0) is in force kLayoutNotice ticks after all have heard of it,
   // or its outcome says why it is not.
+  // A region that leaves has no outcomes of what it told in its last tick, nor of what still waited: clients ask again
+  // elsewhere.
   absl::Status Submit(const Input& input);
   // Of what was submitted, that which waits for an exchange with room for it.
   size_t inputs_waiting() const;

@@ -210,8 +210,9 @@ class SyncExchange final : public Protocol {
   }
 
   void AdoptLayout(std::vector<Frame>* out) {
+    if (h_.division.next_at() != now()) return;
     const Division::State before = h_.division.now();
-    if (!h_.division.Adopt(now())) return;
+    h_.division.Adopt(now());
     const std::vector<RegionId> peers = h_.peers;
     const std::vector<Opening> open = std::move(open_);
     h_.FollowDivision();
