@@ -223,7 +223,7 @@ int Up(const UpOptions& options) {
   run.last_tick = heading.last_tick;
   run.hash_every = options.hash_every >= 0 ? options.hash_every : heading.last_tick > 0 ? kDefaultHashEvery : 0;
 
-  run.checkpoint_every = TicksIn(options.checkpoint_s, heading.tick_us);
+  if (options.checkpoint_s > 0) run.checkpoint_every = TicksIn(options.checkpoint_s, heading.tick_us);
 
   run.security.tls = options.tls;
   run.security.tokens = options.tokens;

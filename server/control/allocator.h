@@ -17,7 +17,7 @@ struct ServerStart {
   uint64_t incarnation = 1;  // grows with every server of the region
   std::string token;         // what the server says in its Hello
   std::string control;       // where it says it, host:port
-  std::string listen = {};  // where the last one listened: clients look for it there; empty: anywhere
+  std::string listen = {};   // where the last one listened: clients look for it there; empty: anywhere
 };
 
 struct ServerExit {

@@ -67,7 +67,7 @@ int main(int argc, char** argv) {
   const int64_t tick_us = file->world.environment.tick_us;
   if (!duration.empty()) options.last_tick = aureole::TicksIn(absl::ToDoubleSeconds(length), tick_us);
 
-  options.checkpoint_every = aureole::TicksIn(checkpoint_s, tick_us);
+  if (checkpoint_s > 0) options.checkpoint_every = aureole::TicksIn(checkpoint_s, tick_us);
 
   servers.verbose = true;
   servers.flags = aureole::FlagsOf(options.security);

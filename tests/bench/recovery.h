@@ -7,7 +7,7 @@
 namespace aureole {
 
 struct RecoveryOptions {
-  std::string world = "tests/worlds/corner-storm.json";
+  std::string world = "tests/worlds/demo.json";
   int kills = 200;
   int every_ms = 400;  // wall time between kills, on average; one time in four two servers at once
   uint32_t seed = 1;

@@ -3,7 +3,9 @@
 
 #include <signal.h>
 
+#include <algorithm>
 #include <chrono>
+#include <map>
 #include <random>
 
 #include "server/control/run_status.h"
@@ -17,7 +19,7 @@ class Killer {
   // `every`: wall time between kills, on average.
   Killer(uint32_t seed, int kills, std::chrono::milliseconds every) : random_(seed), left_(kills), every_(every) {}
 
-  // Call it often. A region that was killed is left alone until it ticks again.
+  // Call it often. A region that was killed is mostly left alone until it gets further than it was.
   void Look(const RunStatus& status) {
     if (status.stage != Stage::kRunning || left_ == 0) return;
     const auto now = Clock::now();
@@ -30,8 +32,11 @@ class Killer {
     if (now < next_) return;
     const int together = random_() % 4 == 0 ? 2 : 1;
     for (int i = 0; i < together && left_ > 0; ++i) {
-      const RegionStatus& r = status.regions[random_() % status.regions.size()];
-      if (!r.joined || !r.ready || r.left || r.pid <= 0) continue;
+      const size_t region = random_() % status.regions.size();
+      const RegionStatus& r = status.regions[region];
+      const bool further = r.report.tick() > killed_at_[region] || random_() % 4 == 0;
+      if (!r.joined || !r.ready || r.left || r.pid <= 0 || !further) continue;
+      killed_at_[region] = std::max(killed_at_[region], r.report.tick());
       if (kill(static_cast<pid_t>(r.pid), SIGKILL) == 0) {
         --left_;
         ++killed_;
@@ -51,6 +56,7 @@ class Killer {
   Clock::time_point next_{}, moved_{};
   Clock::duration longest_stop_{};
   Tick tick_ = -1;
+  std::map<size_t, int64_t> killed_at_;  // by region: the tick
 };
 
 }  // namespace aureole

@@ -265,7 +265,7 @@ TEST(Handshake, WhatDiffersIsNamed) {
     EXPECT_NE(verdict.error_message().find(what), std::string::npos) << verdict.error_message();
     EXPECT_EQ(high.service().refused(), ++refusals);
   };
-  refused("protocol version is 5 here and 9 in region 0", [](v1::LinkHello* h) { h->set_protocol_version(9); });
+  refused("protocol version is 6 here and 9 in region 0", [](v1::LinkHello* h) { h->set_protocol_version(9); });
   refused("world hash is 0000000000abcdef here and 0000000000000005", [](v1::LinkHello* h) { h->set_world_hash(5); });
   refused("layout epoch is 3 here and 4", [](v1::LinkHello* h) { h->set_layout_epoch(4); });
   refused("exchange delay is 0 here and 2", [](v1::LinkHello* h) { h->set_exchange_delay(2); });
