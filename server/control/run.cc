@@ -71,9 +71,10 @@ class Runner {
     uint64_t incarnation = 0;
     bool alive = false;
     Clock::time_point ended;
-    Tick furthest = 0;  // that any server of it had reported when it ended
-    int failures = 0;   // in a row, without getting further
-    ServerExit exit;    // when it is not alive
+    Tick furthest = 0;            // that any server of it had reported when it ended
+    int failures = 0;             // in a row, without getting further
+    ServerExit exit;              // when it is not alive
+    std::string storage_failure;  // as it was told of
   };
 
   absl::Status Serve() {
@@ -115,6 +116,7 @@ class Runner {
     for (;;) {
       TakeExits();
       const RunStatus status = service_->Status();
+      TellOfStorage(status);
       if (absl::Status s = Act(status); !s.ok()) return s;
       const auto now = Clock::now();
       if (status.stage >= Stage::kRunning && !running_) {
@@ -209,6 +211,19 @@ class Runner {
     server.alive = true;
     server.exit = {};
     return absl::OkStatus();
+  }
+
+  // A region that cannot write goes on; if it dies then, what it did since its last checkpoint may be lost.
+  void TellOfStorage(const RunStatus& status) {
+    for (size_t i = 0; i < servers_.size(); ++i) {
+      const std::string& failure = status.regions[i].report.storage_failure();
+      std::string& told = servers_[i].storage_failure;
+      if (failure.empty() != told.empty()) {
+        Tell(static_cast<RegionId>(i),
+             failure.empty() ? "is protected by checkpoints again" : "is not protected by checkpoints: " + failure);
+      }
+      told = failure;
+    }
   }
 
   void Tell(RegionId region, const std::string& what) const {

@@ -3,10 +3,15 @@
 #include <signal.h>
 #include <unistd.h>
 
+#include <atomic>
 #include <cstdlib>
 #include <filesystem>
 #include <fstream>
+#include <map>
+#include <thread>
 
+#include "aureole/client.h"
+#include "client/src/push_sender.h"
 #include "server/control/local_allocator.h"
 #include "server/control/run.h"
 #include "server/control/world_file.h"
@@ -85,6 +90,82 @@ TEST_F(Recovery, ServersKilledAtRandomMomentsChangeNoBit) {
   ExpectExact(options);
 }
 
+// Weightless, three regions; bodies fly to and fro over the borders in lanes of their own.
+v1::WorldSpec Lanes(int bodies) {
+  v1::WorldSpec spec;
+  spec.set_name("lanes");
+  spec.mutable_gravity();
+  for (double edge : {-5, 5}) spec.mutable_layout()->mutable_columns()->add_edges(edge);
+  spec.mutable_client_limits()->set_rate(1e6);
+  for (int i = 0; i < bodies; ++i) {
+    v1::Body* b = spec.add_bodies();
+    b->set_id(static_cast<uint64_t>(i + 1));
+    b->mutable_shape()->mutable_sphere()->set_radius(0.3);
+    b->set_mass(1);
+    b->mutable_position()->set_x(i % 2 == 0 ? -12 : 12);
+    b->mutable_position()->set_z(3 * i);
+    b->mutable_velocity()->set_x(i % 2 == 0 ? 2 : -2);
+  }
+  return spec;
+}
+
+TEST_F(Recovery, PushesOfAClientActOnceEachWhileServersDie) {
+  constexpr int kBodies = 16, kPushes = 6000;
+  constexpr double kPush = 1.0 / 1024;  // m/s: sums are exact
+  RunOptions options;
+  options.world = Lanes(kBodies);
+  options.regions = 3;
+  options.checkpoint_every = 40;
+  Killer killer(3, 12, milliseconds(400));
+  std::vector<double> expected(kBodies, 0);
+  std::map<uint64_t, double> found;
+  client::PushCounts counts;
+  std::atomic<bool> pushed = false, seen = false;
+  std::thread player;
+  const auto play = [&](const std::vector<std::string>& endpoints) {
+    client::PushSender sender(endpoints, 99);
+    for (int n = 0; n < kPushes; ++n) {
+      client::Push push;
+      push.body = static_cast<uint64_t>(1 + n * 7 % kBodies);
+      push.kind = client::Push::Kind::kVelocityChange;
+      push.linear.y = kPush;
+      expected[push.body - 1] += kPush;
+      sender.Send(push);
+      std::this_thread::sleep_for(milliseconds(1));
+    }
+    EXPECT_TRUE(sender.Flush(60));
+    counts = sender.counts();
+    pushed = true;  // and nobody is killed any more
+    std::unique_ptr<client::Client> client;
+    const client::Status s = client::Client::Connect(endpoints[0], &client, 20);
+    EXPECT_TRUE(s.ok()) << s.message;
+    client::WatchOptions exact;
+    exact.precision = client::Precision::kExact;
+    EXPECT_TRUE(s.ok() && client->Watch(exact).ok() && client->WaitUntilComplete(30));
+    std::vector<client::Body> bodies;
+    if (s.ok()) client->Latest(&bodies);
+    for (const client::Body& b : bodies) found[b.id] = b.velocity.y;
+    seen = true;
+  };
+  const absl::Status s = Run(options, [&](const RunStatus& status) {
+    if (status.stage != Stage::kRunning || status.MinTick() < 5) return true;
+    if (!player.joinable()) {
+      std::vector<std::string> endpoints;
+      for (const RegionStatus& r : status.regions) endpoints.push_back(r.endpoint);
+      player = std::thread([play, endpoints] { play(endpoints); });
+    }
+    if (!pushed) killer.Look(status);
+    return !seen;
+  });
+  player.join();
+  EXPECT_EQ(s.code(), absl::StatusCode::kCancelled) << s;
+  EXPECT_GE(killer.killed(), 6);
+  EXPECT_EQ(counts.rejected, 0);
+  EXPECT_EQ(counts.applied, int64_t{kPushes});
+  ASSERT_EQ(found.size(), size_t{kBodies});
+  for (const auto& [id, velocity] : found) EXPECT_EQ(velocity, expected[id - 1]) << "body " << id;
+}
+
 TEST_F(Recovery, AllServersKilledAtOnceGoOn) {
   const RunOptions options = OptionsFor("demo.json", 250);
   bool killed = false;
@@ -131,6 +212,28 @@ TEST_F(Recovery, DamagedCheckpointEndsTheRunAndIsNamed) {
   });
   EXPECT_EQ(s.code(), absl::StatusCode::kAborted) << s;
   EXPECT_NE(s.message().find("data/region-3/checkpoint: the checkpoint's check sum is wrong"), std::string::npos) << s;
+}
+
+TEST_F(Recovery, RegionThatCannotWriteGoesOnAndSaysSo) {
+  const RunOptions options = OptionsFor("demo.json", 300);
+  const fs::path data = directory_ / "data/region-1", away = directory_ / "data/away";
+  enum { kBefore, kAway, kBack } phase = kBefore;
+  const absl::Status s = Run(options, [&](const RunStatus& status) {
+    if (phase == kBefore && status.MinTick() > 60) {
+      fs::rename(data, away);
+      phase = kAway;
+    } else if (phase == kAway && events_.find("region 1: is not protected") != std::string::npos) {
+      fs::rename(away, data);
+      phase = kBack;
+    }
+    return true;
+  });
+  ASSERT_TRUE(s.ok()) << s;
+  EXPECT_NE(events_.find("region 1: is not protected by checkpoints: cannot write " + data.string()), std::string::npos)
+      << events_;
+  EXPECT_NE(events_.find("region 1: is protected by checkpoints again"), std::string::npos) << events_;
+  EXPECT_GT(result_.status.regions[1].report.storage_failures(), 0);
+  ExpectExact(options);
 }
 
 TEST_F(Recovery, WithoutCheckpointsADeadServerEndsTheRun) {
