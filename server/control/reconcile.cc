@@ -9,10 +9,11 @@
 namespace aureole {
 namespace {
 
-// Why a server that runs is given up; empty when it is not.
-std::string Lost(const RegionObserved& r) {
+// Why a server that runs is given up; empty when it is not. One that cannot be replaced is waited for.
+std::string Lost(const RegionObserved& r, bool recovers) {
   if (r.joined && !r.connected && r.silent_s > kExitAfterLeaveSeconds) return "its stream ended";
-  if (r.joined && r.silent_s > kLeaseSeconds) return absl::StrFormat("nothing heard of it for %.1f s", r.silent_s);
+  if (recovers && r.joined && r.silent_s > kLeaseSeconds)
+    return absl::StrFormat("nothing heard of it for %.1f s", r.silent_s);
   return "";
 }
 
@@ -21,7 +22,7 @@ void ReconcileRegion(RegionId region, const RegionObserved& r, bool recovers, st
     out->push_back({kind, region, incarnation, std::move(why)});
   };
   if (r.incarnation == 0) return act(Action::Kind::kStart, 1, "the world begins");
-  const std::string lost = r.alive ? Lost(r) : r.how;
+  const std::string lost = r.alive ? Lost(r, recovers) : r.how;
   if (lost.empty() || (!r.alive && r.clean && r.finished)) return;
   if (!recovers || r.failures >= kMostFailures) return act(Action::Kind::kGiveUp, r.incarnation, lost);
   // Two servers of a region must not write to one directory: the next one starts when the allocator says that the last

@@ -91,6 +91,12 @@ TEST(Reconcile, WithoutCheckpointsTheFirstLossEndsTheRun) {
   EXPECT_EQ(Decide(Dead(), false), "give up 3: killed by signal 9");
 }
 
+TEST(Reconcile, SilentServerThatCannotBeReplacedIsWaitedFor) {
+  RegionObserved r = Running();
+  r.silent_s = 100 * kLeaseSeconds;
+  EXPECT_EQ(Decide(r, false), "");
+}
+
 TEST(Reconcile, RegionsThatHaveFinishedMayGo) {
   RegionObserved r = Dead("exit status 0");
   r.clean = r.finished = true;
