@@ -6,6 +6,7 @@
 #include <memory>
 #include <random>
 
+#include <absl/strings/match.h>
 #include <absl/strings/str_cat.h>
 #include <absl/strings/str_format.h>
 #include <absl/strings/str_join.h>
@@ -75,6 +76,7 @@ class Runner {
     int failures = 0;             // in a row, without getting further
     ServerExit exit;              // when it is not alive
     std::string storage_failure;  // as it was told of
+    bool port_lost = false;       // it could not even listen
   };
 
   absl::Status Serve() {
@@ -149,6 +151,8 @@ class Runner {
       const Tick tick = status.regions[static_cast<size_t>(exit.region)].report.tick();
       server.failures = tick > server.furthest ? 0 : server.failures + 1;
       server.furthest = std::max(server.furthest, tick);
+      const bool killed = absl::StartsWith(exit.how, "killed");
+      server.port_lost = !killed && !status.regions[static_cast<size_t>(exit.region)].joined;
       server.exit = exit;
     }
   }
@@ -202,8 +206,8 @@ class Runner {
     if (a.incarnation > 1) {
       token = MakeToken();
       service_->Expect(a.region, a.incarnation, token);
-      // Once: another program may have taken the port.
-      if (server.failures == 0) listen = service_->Status().regions[static_cast<size_t>(a.region)].endpoint;
+      // Clients look for it there, unless another program has taken the port.
+      if (!server.port_lost) listen = service_->Status().regions[static_cast<size_t>(a.region)].endpoint;
       Tell(a.region, absl::StrCat("incarnation ", a.incarnation, " is started: ", a.why));
     }
     if (absl::Status s = allocator_.Start({a.region, a.incarnation, token, address_, listen}); !s.ok()) return s;

@@ -42,7 +42,8 @@ TickLoop::TickLoop(const World& world, Region* region, RegionLinks* links, Journ
       hooks_(std::move(hooks)),
       windows_(world.environment.tick_us),
       replaying_(options_.recovered),
-      checkpointed_(region->tick()) {
+      checkpointed_(region->tick()),
+      recovered_at_(region->tick()) {
   for (const aureole::Checkpoint::Hash& h : options_.hashes) AddHash(h);
 }
 
@@ -113,7 +114,10 @@ void TickLoop::OfferInputs() {
     for (const Input& input : logged_) Submit(input);
     logged_.clear();
   }
-  if (replaying_ || region_->inputs_waiting() > 0) return;
+  // When all servers died, none knows how far the world had come, and a client's newer inputs must not overtake those
+  // that another region's log still holds for later ticks. Checkpoints are never further behind than this.
+  const bool behind = options_.recovered && n <= recovered_at_ + 2 * options_.checkpoint_every;
+  if (replaying_ || behind || region_->inputs_waiting() > 0) return;
   std::vector<Input> inputs = hooks_.inputs();
   if (journal_ == nullptr) {
     for (const Input& input : inputs) Submit(input);
