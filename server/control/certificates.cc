@@ -20,22 +20,16 @@
 #include <absl/time/clock.h>
 
 #include "server/control/write_file.h"
+#include "server/transport/openssl_ptr.h"
 #include "server/transport/server_certificate.h"
 
 namespace aureole {
 namespace {
 
-template <auto free>
-struct Free {
-  template <class T>
-  void operator()(T* p) const {
-    free(p);
-  }
-};
-using Bio = std::unique_ptr<BIO, Free<BIO_free_all>>;
-using Key = std::unique_ptr<EVP_PKEY, Free<EVP_PKEY_free>>;
-using Certificate = std::unique_ptr<X509, Free<X509_free>>;
-using Extension = std::unique_ptr<X509_EXTENSION, Free<X509_EXTENSION_free>>;
+using Bio = OpensslPtr<BIO, BIO_free_all>;
+using Key = OpensslPtr<EVP_PKEY, EVP_PKEY_free>;
+using Certificate = OpensslPtr<X509, X509_free>;
+using Extension = OpensslPtr<X509_EXTENSION, X509_EXTENSION_free>;
 
 constexpr absl::Duration kAuthorityValid = absl::Hours(24 * 3650);
 // Clocks of other machines may be behind.
@@ -75,7 +69,7 @@ bool FillIn(X509* certificate, EVP_PKEY* key, const std::string& name, const Val
   unsigned char serial[20];
   if (RAND_bytes(serial, sizeof serial) != 1) return false;
   serial[0] &= 0x7f;
-  const std::unique_ptr<BIGNUM, Free<BN_free>> number(BN_bin2bn(serial, sizeof serial, nullptr));
+  const OpensslPtr<BIGNUM, BN_free> number(BN_bin2bn(serial, sizeof serial, nullptr));
   return number != nullptr && BN_to_ASN1_INTEGER(number.get(), X509_get_serialNumber(certificate)) != nullptr &&
          X509_set_version(certificate, X509_VERSION_3) == 1 && X509_set_pubkey(certificate, key) == 1 &&
          ASN1_TIME_set(X509_getm_notBefore(certificate), absl::ToTimeT(validity.from)) != nullptr &&

@@ -1,10 +1,9 @@
 #include "server/region/checkpoint.h"
 
-#include <zlib.h>
-
 #include <absl/strings/str_cat.h>
 
 #include "server/core/archive.h"
+#include "server/region/check_sum.h"
 
 namespace aureole {
 
@@ -20,10 +19,6 @@ constexpr uint64_t kMagic = 0x3154504b43524100;  // of this layout of the bytes
 template <class Archive>
 void VisitCheckpoint(Archive& a, Checkpoint& c) {
   a(c.world_hash, c.region, c.tick, c.state, c.links, c.hashes);
-}
-
-uint32_t CheckSum(std::string_view bytes) {
-  return static_cast<uint32_t>(crc32_z(0, reinterpret_cast<const Bytef*>(bytes.data()), bytes.size()));
 }
 
 }  // namespace

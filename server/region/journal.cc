@@ -2,7 +2,6 @@
 
 #include <fcntl.h>
 #include <unistd.h>
-#include <zlib.h>
 
 #include <algorithm>
 #include <cerrno>
@@ -17,6 +16,7 @@
 
 #include "server/core/archive.h"
 #include "server/core/check.h"
+#include "server/region/check_sum.h"
 
 namespace aureole {
 namespace {
@@ -63,10 +63,6 @@ absl::StatusOr<std::string> ReadAll(const std::filesystem::path& path) {
   std::string bytes(std::istreambuf_iterator<char>(in), {});
   if (in.bad()) return Failed("read", path);
   return bytes;
-}
-
-uint32_t CheckSum(std::string_view bytes) {
-  return static_cast<uint32_t>(crc32_z(0, reinterpret_cast<const Bytef*>(bytes.data()), bytes.size()));
 }
 
 // A record: size and check sum of what follows; tick, input.

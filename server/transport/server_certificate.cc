@@ -11,20 +11,15 @@
 
 #include <absl/strings/str_cat.h>
 
+#include "server/transport/openssl_ptr.h"
+
 namespace aureole {
 namespace {
 
-template <auto free>
-struct Free {
-  template <class T>
-  void operator()(T* p) const {
-    free(p);
-  }
-};
-using Certificate = std::unique_ptr<X509, Free<X509_free>>;
+using Certificate = OpensslPtr<X509, X509_free>;
 
 std::vector<Certificate> Read(const std::string& pem) {
-  const std::unique_ptr<BIO, Free<BIO_free_all>> in(BIO_new_mem_buf(pem.data(), static_cast<int>(pem.size())));
+  const OpensslPtr<BIO, BIO_free_all> in(BIO_new_mem_buf(pem.data(), static_cast<int>(pem.size())));
   std::vector<Certificate> out;
   while (X509* certificate = PEM_read_bio_X509(in.get(), nullptr, nullptr, nullptr)) out.emplace_back(certificate);
   ERR_clear_error();  // the end of the text is one
@@ -37,10 +32,11 @@ absl::Status CheckServerCertificate(const std::string& chain, const std::string&
   const std::vector<Certificate> shown = Read(chain), trusted = Read(authorities);
   if (shown.empty()) return absl::UnauthenticatedError("there is no certificate");
   if (trusted.empty()) return absl::UnauthenticatedError("there is no authority to trust");
-  const std::unique_ptr<X509_STORE, Free<X509_STORE_free>> store(X509_STORE_new());
-  const std::unique_ptr<X509_STORE_CTX, Free<X509_STORE_CTX_free>> check(X509_STORE_CTX_new());
+  const OpensslPtr<X509_STORE, X509_STORE_free> store(X509_STORE_new());
+  const OpensslPtr<X509_STORE_CTX, X509_STORE_CTX_free> check(X509_STORE_CTX_new());
   // Certificates stay ours.
-  const std::unique_ptr<STACK_OF(X509), Free<[](STACK_OF(X509) * s) { sk_X509_free(s); }>> between(sk_X509_new_null());
+  const std::unique_ptr<STACK_OF(X509), OpensslFree<[](STACK_OF(X509) * s) { sk_X509_free(s); }>> between(
+      sk_X509_new_null());
   bool made = store != nullptr && check != nullptr && between != nullptr;
   for (const Certificate& c : trusted) made = made && X509_STORE_add_cert(store.get(), c.get()) == 1;
   for (const Certificate& c : shown) made = made && sk_X509_push(between.get(), c.get()) > 0;

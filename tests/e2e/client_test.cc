@@ -32,25 +32,6 @@ void RunDemo(const Play& play) {
   PlayIn(file->spec, file->world.layout.size(), play);
 }
 
-// Weightless, three regions; bodies fly to and fro over the borders in lanes of their own.
-v1::WorldSpec Lanes(int bodies) {
-  v1::WorldSpec spec;
-  spec.set_name("lanes");
-  spec.mutable_gravity();
-  for (double edge : {-5, 5}) spec.mutable_layout()->mutable_columns()->add_edges(edge);
-  spec.mutable_client_limits()->set_rate(1e6);
-  for (int i = 0; i < bodies; ++i) {
-    v1::Body* b = spec.add_bodies();
-    b->set_id(static_cast<uint64_t>(i + 1));
-    b->mutable_shape()->mutable_sphere()->set_radius(0.3);
-    b->set_mass(1);
-    b->mutable_position()->set_x(i % 2 == 0 ? -12 : 12);
-    b->mutable_position()->set_z(3 * i);
-    b->mutable_velocity()->set_x(i % 2 == 0 ? 4 : -4);
-  }
-  return spec;
-}
-
 std::unique_ptr<Client> Connected(const std::string& server) {
   std::unique_ptr<Client> out;
   const client::Status s = Client::Connect(server, &out);

@@ -16,6 +16,7 @@
 #include "server/control/run.h"
 #include "server/control/world_file.h"
 #include "tests/e2e/killer.h"
+#include "tests/e2e/running_world.h"
 
 namespace aureole {
 namespace {
@@ -88,25 +89,6 @@ TEST_F(Recovery, ServersKilledAtRandomMomentsChangeNoBit) {
   EXPECT_GE(killer.killed(), 6);
   EXPECT_LT(killer.longest_stop().count(), 10);
   ExpectExact(options);
-}
-
-// Weightless, three regions; bodies fly to and fro over the borders in lanes of their own.
-v1::WorldSpec Lanes(int bodies) {
-  v1::WorldSpec spec;
-  spec.set_name("lanes");
-  spec.mutable_gravity();
-  for (double edge : {-5, 5}) spec.mutable_layout()->mutable_columns()->add_edges(edge);
-  spec.mutable_client_limits()->set_rate(1e6);
-  for (int i = 0; i < bodies; ++i) {
-    v1::Body* b = spec.add_bodies();
-    b->set_id(static_cast<uint64_t>(i + 1));
-    b->mutable_shape()->mutable_sphere()->set_radius(0.3);
-    b->set_mass(1);
-    b->mutable_position()->set_x(i % 2 == 0 ? -12 : 12);
-    b->mutable_position()->set_z(3 * i);
-    b->mutable_velocity()->set_x(i % 2 == 0 ? 2 : -2);
-  }
-  return spec;
 }
 
 TEST_F(Recovery, PushesOfAClientActOnceEachWhileServersDie) {
