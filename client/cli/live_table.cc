@@ -50,6 +50,7 @@ const char* Name(Stage stage) {
     case Stage::kJoining:
       return "starting";
     case Stage::kLoading:
+    case Stage::kReady:
       return "loading";
     case Stage::kRunning:
       return "running";

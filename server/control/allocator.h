@@ -1,5 +1,5 @@
-// Starts and watches the servers of a world's regions. LocalAllocator runs them as processes of this machine; tests run
-// them as threads; a cluster's scheduler is the next one.
+// Starts and watches the servers of a world's regions. LocalAllocator runs them as processes of this machine,
+// PodAllocator as Pods of a cluster, tests as threads.
 #pragma once
 
 #include <cstdint>
@@ -7,6 +7,7 @@
 #include <vector>
 
 #include <absl/status/status.h>
+#include <absl/status/statusor.h>
 
 #include "server/core/types.h"
 
@@ -32,8 +33,14 @@ struct ServerExit {
 // One thread at a time: the one that made it.
 class Allocator {
  public:
-  // Leaves no server behind.
+  // Leaves no server behind, unless they were released.
   virtual ~Allocator() = default;
+
+  // Servers that an earlier control plane of this world has started and that may still run: they count as started here.
+  // Once, before the first Start.
+  virtual absl::StatusOr<std::vector<ServerStart>> Adopt() { return std::vector<ServerStart>(); }
+  // From here on the servers go on by themselves, for the next control plane to adopt; nothing else is called.
+  virtual void Release() {}
 
   // Returns once the server is started, not once it has joined. NotFound or Internal say why it could not.
   virtual absl::Status Start(const ServerStart& start) = 0;

@@ -6,6 +6,8 @@
 
 #include <absl/strings/str_cat.h>
 
+#include "server/transport/world_spec.h"
+
 namespace aureole {
 namespace {
 
@@ -24,11 +26,14 @@ grpc::Status ToGrpc(const absl::Status& s) {
 // because gRPC runs reactions on its own threads, never inside of a call.
 class ControlService::Session final : public grpc::ServerBidiReactor<v1::FromRegion, v1::ToRegion> {
  public:
-  explicit Session(ControlService* service) : service_(service) { StartRead(&in_); }
+  explicit Session(ControlService* service) : service_(service) {}
+
+  void Begin() { StartRead(&in_); }
 
   // With the service's mutex.
   void Send(v1::ToRegion message) {
     if (closed_) return;
+    message.set_control_epoch(service_->plan_.control_epoch);
     out_.push_back(std::move(message));
     if (out_.size() == 1) StartWrite(&out_.front());
   }
@@ -75,28 +80,46 @@ class ControlService::Session final : public grpc::ServerBidiReactor<v1::FromReg
   bool closed_ = false;
 };
 
-ControlService::ControlService(RunPlan plan) : plan_(std::move(plan)), regions_(plan_.tokens.size()) {
+ControlService::ControlService(RunPlan plan)
+    : plan_(std::move(plan)), world_hash_(WorldHash(plan_.world)), regions_(plan_.regions.size()) {
   for (size_t i = 0; i < regions_.size(); ++i) {
-    regions_[i].token = plan_.tokens[i];
-    regions_[i].status.reported = std::chrono::steady_clock::now();
+    const RunPlan::Region& from = plan_.regions[i];
+    regions_[i].token = from.token;
+    RegionStatus& status = regions_[i].status;
+    status.incarnation = from.incarnation;
+    status.was_ready = from.was_ready;
+    status.endpoint = from.endpoint;
+    status.reported = std::chrono::steady_clock::now();
   }
+  start_unix_us_ = plan_.start_unix_us;
+  if (start_unix_us_ != 0) stage_ = Stage::kRunning;
 }
 
 ControlService::~ControlService() {
   std::unique_lock lock(mutex_);
-  changed_.wait(lock, [this] { return sessions_ == 0; });
+  changed_.wait(lock, [this] { return sessions_.empty(); });
 }
 
 grpc::ServerBidiReactor<v1::FromRegion, v1::ToRegion>* ControlService::Join(grpc::CallbackServerContext*) {
   const std::lock_guard lock(mutex_);
-  ++sessions_;
-  return new Session(this);
+  auto* session = new Session(this);
+  sessions_.insert(session);
+  session->Begin();
+  return session;
+}
+
+void ControlService::Close() {
+  const std::lock_guard lock(mutex_);
+  for (Session* session : sessions_) {
+    session->Close({grpc::StatusCode::UNAVAILABLE, "this control plane leaves; join the next one"});
+  }
 }
 
 RunStatus ControlService::Status() const {
   const std::lock_guard lock(mutex_);
   RunStatus out;
   out.stage = stage_;
+  out.start_unix_us = start_unix_us_;
   for (const RegionRecord& record : regions_) out.regions.push_back(record.status);
   return out;
 }
@@ -141,7 +164,7 @@ void ControlService::Stop(const std::string& reason) {
 
 void ControlService::Leave(Session* session) {
   const std::lock_guard lock(mutex_);
-  --sessions_;
+  sessions_.erase(session);
   if (session->region != kNoRegion && regions_[session->region].session == session) {
     regions_[session->region].session = nullptr;
     regions_[session->region].status.left = true;
@@ -184,28 +207,78 @@ absl::Status ControlService::HandleHello(Session* session, const v1::Hello& hell
   }
   const RegionId region = static_cast<RegionId>(found - regions_.begin());
   RegionRecord& record = *found;
-  if (record.status.joined) {
+  if (hello.has_running()) {
+    if (absl::Status s = HandleRunning(record, hello.running()); !s.ok()) return s;
+  } else if (record.session != nullptr || record.assigned) {
     return absl::AlreadyExistsError(absl::StrCat("hello.token: region ", region, " has joined already"));
   }
+  // The stream before may not have been seen to end.
+  if (record.session != nullptr) record.session->Close({grpc::StatusCode::ABORTED, "this server has joined again"});
   session->region = region;
   record.session = session;
   record.status.joined = true;
+  record.status.left = false;
+  record.status.goodbye.clear();
   record.status.endpoint = hello.endpoint();
   record.status.metrics_endpoint = hello.metrics_endpoint();
   record.status.pid = hello.pid();
   record.status.reported = std::chrono::steady_clock::now();
-  if (stage_ != Stage::kJoining) {
+  if (hello.has_running()) {
+    Resume(region, hello.running());
+  } else if (stage_ != Stage::kJoining) {
     Assign(region);
-  } else if (std::all_of(regions_.begin(), regions_.end(), [](const RegionRecord& r) { return r.status.joined; })) {
+  }
+  if (stage_ == Stage::kJoining &&
+      std::all_of(regions_.begin(), regions_.end(), [](const RegionRecord& r) { return r.status.joined; })) {
     AssignAll();
   }
   Changed();
   return absl::OkStatus();
 }
 
+// Of a server that joins again: nothing changes here.
+absl::Status ControlService::HandleRunning(const RegionRecord& record, const v1::Running& running) const {
+  const auto region = static_cast<RegionId>(&record - regions_.data());
+  if (running.region() != region || running.incarnation() != record.status.incarnation) {
+    return absl::FailedPreconditionError(absl::StrCat("hello.running: is incarnation ", running.incarnation(),
+                                                      " of region ", running.region(), ", its token is of incarnation ",
+                                                      record.status.incarnation, " of region ", region));
+  }
+  if (running.world_hash() != world_hash_) {
+    return absl::FailedPreconditionError("hello.running.world_hash: is of another world");
+  }
+  if (running.tick() < record.status.report.tick()) {
+    return absl::InvalidArgumentError(absl::StrCat("hello.running.tick: is ", running.tick(), " after ",
+                                                   record.status.report.tick(), "; time does not run back"));
+  }
+  return absl::OkStatus();
+}
+
+// What happened while it was away it is told now.
+void ControlService::Resume(RegionId region, const v1::Running& running) {
+  RegionRecord& record = regions_[region];
+  record.assigned = record.status.ready = record.status.was_ready = true;
+  record.status.report.set_tick(running.tick());
+  record.status.report.set_bodies(running.bodies());
+  for (size_t i = 0; i < regions_.size(); ++i) {
+    const auto peer = static_cast<RegionId>(i);
+    if (peer != region && !regions_[i].status.endpoint.empty()) record.session->Send(Moved(peer));
+  }
+  if (start_unix_us_ == 0) start_unix_us_ = running.start_unix_us();
+  if (start_unix_us_ != 0) {
+    stage_ = std::max(stage_, Stage::kRunning);
+    if (running.start_unix_us() == 0) Start(&record);
+  } else {
+    CheckReady();
+  }
+}
+
 void ControlService::AssignAll() {
   stage_ = Stage::kLoading;
-  for (size_t i = 0; i < regions_.size(); ++i) Assign(static_cast<RegionId>(i));
+  for (size_t i = 0; i < regions_.size(); ++i) {
+    if (!regions_[i].assigned) Assign(static_cast<RegionId>(i));
+  }
+  CheckReady();
 }
 
 void ControlService::Assign(RegionId region) {
@@ -222,7 +295,7 @@ void ControlService::Assign(RegionId region) {
   a->set_layout_epoch(1);
   a->set_incarnation(to.status.incarnation);
   a->set_checkpoint_every(plan_.checkpoint_every);
-  a->set_recover(to.was_ready);
+  a->set_recover(to.status.was_ready);
   a->set_undivided(plan_.undivided);
   a->set_no_real_time(plan_.no_real_time);
   a->set_last_tick(plan_.last_tick);
@@ -237,6 +310,7 @@ void ControlService::Expect(RegionId region, uint64_t incarnation, const std::st
   if (record.session != nullptr) {
     record.session->Close({grpc::StatusCode::FAILED_PRECONDITION, "this server has been replaced"});
   }
+  if (stage_ == Stage::kReady) stage_ = Stage::kLoading;
   record.session = nullptr;
   record.token = token;
   record.assigned = false;
@@ -250,13 +324,18 @@ void ControlService::Expect(RegionId region, uint64_t incarnation, const std::st
   Changed();
 }
 
-// A server that was told the endpoint before it was there has to find the new one.
-void ControlService::TellMoved(RegionId region) {
+v1::ToRegion ControlService::Moved(RegionId region) const {
   v1::ToRegion message;
   v1::PeerMoved* moved = message.mutable_peer_moved();
   moved->set_region(region);
   moved->set_endpoint(regions_[region].status.endpoint);
   moved->set_incarnation(regions_[region].status.incarnation);
+  return message;
+}
+
+// A server that was told the endpoint before it was there has to find the new one.
+void ControlService::TellMoved(RegionId region) {
+  const v1::ToRegion message = Moved(region);
   for (size_t i = 0; i < regions_.size(); ++i) {
     const bool told = regions_[i].assigned && static_cast<RegionId>(i) != region;
     if (told && regions_[i].session != nullptr) regions_[i].session->Send(message);
@@ -268,27 +347,34 @@ absl::Status ControlService::HandleReady(RegionId region, const v1::Ready& ready
   if (!record->assigned || record->status.ready) {
     return absl::FailedPreconditionError("a Ready before the Assignment, or a second one");
   }
-  record->status.ready = true;
-  record->was_ready = true;
-  record->session_hash = -1;
+  record->status.ready = record->status.was_ready = true;
   record->status.report.set_bodies(ready.bodies());
   record->status.report.set_tick(ready.tick());
   record->status.report.clear_waiting_for();
   if (record->status.incarnation > 1) TellMoved(region);
   if (stage_ == Stage::kRunning) {
     Start(record);
-  } else if (std::all_of(regions_.begin(), regions_.end(), [](const RegionRecord& r) { return r.status.ready; })) {
-    StartAll();
+  } else {
+    CheckReady();
   }
   Changed();
   return absl::OkStatus();
 }
 
-void ControlService::StartAll() {
+void ControlService::CheckReady() {
+  if (stage_ == Stage::kLoading &&
+      std::all_of(regions_.begin(), regions_.end(), [](const RegionRecord& r) { return r.status.ready; })) {
+    stage_ = Stage::kReady;
+  }
+}
+
+void ControlService::StartAll(int64_t start_unix_us) {
+  const std::lock_guard lock(mutex_);
+  if (stage_ != Stage::kReady) return;  // a server has died since
   stage_ = Stage::kRunning;
-  const auto start = std::chrono::system_clock::now() + plan_.start_delay;
-  start_unix_us_ = std::chrono::duration_cast<std::chrono::microseconds>(start.time_since_epoch()).count();
+  start_unix_us_ = start_unix_us;
   for (RegionRecord& record : regions_) Start(&record);
+  Changed();
 }
 
 void ControlService::Start(RegionRecord* record) {
@@ -300,21 +386,19 @@ void ControlService::Start(RegionRecord* record) {
 
 absl::Status ControlService::HandleReport(RegionRecord* record, const v1::Report& report) {
   RegionStatus& status = record->status;
-  if (stage_ != Stage::kRunning || status.finished) {
-    return absl::FailedPreconditionError("a Report before the Start, or after the last one");
-  }
+  if (stage_ != Stage::kRunning) return absl::FailedPreconditionError("a Report before the Start");
+  if (status.finished) return absl::OkStatus();  // who joins again says its last report again
   if (report.tick() < status.report.tick()) {
     return absl::InvalidArgumentError(
         absl::StrCat("report.tick: is ", report.tick(), " after ", status.report.tick(), "; time does not run back"));
   }
-  Tick last_hash = record->session_hash;
+  Tick last_hash = -1;
   for (const v1::TickHash& h : report.hashes()) {
     if (h.tick() <= last_hash) return absl::InvalidArgumentError("report.hashes: ticks must ascend");
     last_hash = h.tick();
   }
-  record->session_hash = last_hash;
   for (const v1::TickHash& h : report.hashes()) {
-    if (h.tick() <= record->last_hash) continue;  // the server before it has said so
+    if (h.tick() <= record->last_hash) continue;  // said again, or by the server before it
     record->last_hash = h.tick();
     TickSum& sum = hashes_[h.tick()];
     sum.tick = h.tick();

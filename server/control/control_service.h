@@ -8,6 +8,7 @@
 #include <map>
 #include <memory>
 #include <mutex>
+#include <set>
 #include <string>
 #include <vector>
 
@@ -22,14 +23,22 @@ inline constexpr uint32_t kControlProtocolVersion = 1;
 
 // What the servers of one run are told.
 struct RunPlan {
+  // What is known of a region before anything is heard of it.
+  struct Region {
+    std::string token;         // what its server says; empty: none is expected yet
+    uint64_t incarnation = 1;  // of that server
+    bool was_ready = false;    // some server of it was: there is a checkpoint
+    std::string endpoint = {};
+  };
   v1::WorldSpec world;
-  std::vector<std::string> tokens;  // one per region; what a server says to be that region
-  bool undivided = false;           // one region, whatever the layout says; then there is one token
+  std::vector<Region> regions;
+  uint64_t control_epoch = 1;  // grows with each control plane that takes over
+  int64_t start_unix_us = 0;   // of a world that an earlier control plane has started
+  bool undivided = false;      // one region, whatever the layout says
   bool no_real_time = false;
-  Tick checkpoint_every = 0;                   // ticks; 0: none, and no region can be replaced
-  Tick last_tick = 0;                          // 0: no end
-  Tick hash_every = 0;                         // ticks; 0: never
-  std::chrono::milliseconds start_delay{300};  // from the last Ready to tick 0
+  Tick checkpoint_every = 0;  // ticks; 0: none, and no region can be replaced
+  Tick last_tick = 0;         // 0: no end
+  Tick hash_every = 0;        // ticks; 0: never
 };
 
 // Serves one run. Thread-safe; no call blocks, except Wait. Shut the gRPC server down before this goes.
@@ -49,11 +58,14 @@ class ControlService final : public v1::Control::CallbackService {
   std::vector<v1::Violation> Violations() const;
   // Returns when something other than a plain report has happened since the last call, or after `longest`.
   void Wait(std::chrono::milliseconds longest);
-  // The region's next server has this incarnation and token. An older one that is still here must leave. Any time; the
-  // plan's tokens are those of incarnation 1.
+  // The region's next server has this incarnation and token. An older one that is still here must leave. Any time.
   void Expect(RegionId region, uint64_t incarnation, const std::string& token);
+  // Tells all servers to begin with tick 0 at this time, at Stage::kReady; else it does nothing.
+  void StartAll(int64_t start_unix_us);
   // Tells every server that is here to end.
   void Stop(const std::string& reason);
+  // Ends all streams: the servers go on, and join again where they find a control plane. No new stream may come.
+  void Close();
 
  private:
   class Session;
@@ -61,31 +73,34 @@ class ControlService final : public v1::Control::CallbackService {
     RegionStatus status;
     Session* session = nullptr;
     std::string token;
-    bool assigned = false;   // the server that is here
-    bool was_ready = false;  // some server of it was: there is a checkpoint
+    bool assigned = false;  // the server that is here
     std::deque<v1::FrameTime> recent;
     std::deque<v1::Window> windows;
-    Tick last_hash = -1, session_hash = -1;  // reported, ever and by this server
+    Tick last_hash = -1;  // reported
   };
 
   // Handles one message of a session; an error ends the session and changes nothing else.
   absl::Status Handle(Session* session, const v1::FromRegion& message);
   absl::Status HandleHello(Session* session, const v1::Hello& hello);
+  absl::Status HandleRunning(const RegionRecord& record, const v1::Running& running) const;
+  void Resume(RegionId region, const v1::Running& running);
   absl::Status HandleReady(RegionId region, const v1::Ready& ready);
   absl::Status HandleReport(RegionRecord* record, const v1::Report& report);
   void Leave(Session* session);
   void AssignAll();
   void Assign(RegionId region);
-  void StartAll();
   void Start(RegionRecord* record);
+  v1::ToRegion Moved(RegionId region) const;
   void TellMoved(RegionId region);
+  void CheckReady();
   void Changed();
 
   const RunPlan plan_;
+  const uint64_t world_hash_;
   mutable std::mutex mutex_;  // guards everything below, and the sessions' own fields
   std::condition_variable changed_;
   uint64_t changes_ = 0, seen_ = 0;
-  int sessions_ = 0;  // alive
+  std::set<Session*> sessions_;  // alive
   Stage stage_ = Stage::kJoining;
   int64_t start_unix_us_ = 0;  // once running
   std::vector<RegionRecord> regions_;

@@ -2,8 +2,10 @@
 
 #include <fcntl.h>
 #include <linux/close_range.h>
+#include <poll.h>
 #include <signal.h>
 #include <sys/prctl.h>
+#include <sys/syscall.h>
 #include <sys/wait.h>
 #include <unistd.h>
 
@@ -14,9 +16,12 @@
 #include <iostream>
 #include <system_error>
 
+#include <absl/strings/match.h>
 #include <absl/strings/str_cat.h>
 #include <absl/strings/str_join.h>
 #include <absl/strings/str_split.h>
+
+#include "server/control/write_file.h"
 
 namespace aureole {
 namespace {
@@ -30,10 +35,15 @@ std::filesystem::path OwnDirectory() {
 }
 
 // Between fork and exec in a process with threads: only async-signal-safe calls, so everything is prepared before.
-[[noreturn]] void RunChild(const char* executable, char* const* arguments, int log, int null, pid_t parent) {
-  setpgid(0, 0);
-  prctl(PR_SET_PDEATHSIG, SIGKILL);
-  if (getppid() != parent) _exit(127);  // it died before the prctl
+[[noreturn]] void RunChild(const char* executable, char* const* arguments, int log, int null, pid_t parent,
+                           bool outlive) {
+  if (outlive) {
+    setsid();
+  } else {
+    setpgid(0, 0);
+    prctl(PR_SET_PDEATHSIG, SIGKILL);
+    if (getppid() != parent) _exit(127);  // it died before the prctl
+  }
   sigset_t none;
   sigemptyset(&none);
   sigprocmask(SIG_SETMASK, &none, nullptr);
@@ -77,6 +87,58 @@ std::filesystem::path LocalAllocator::LogFile(RegionId region) const {
   return options_.log_directory / absl::StrCat("region-", region, ".log");
 }
 
+std::filesystem::path LocalAllocator::DataOf(RegionId region) const {
+  const std::filesystem::path& data =
+      options_.data_directory.empty() ? options_.log_directory : options_.data_directory;
+  return data / absl::StrCat("region-", region);
+}
+
+std::filesystem::path LocalAllocator::ServerFile(RegionId region) const { return DataOf(region).string() + ".server"; }
+
+absl::Status LocalAllocator::WriteServerFile(const ServerStart& start, pid_t pid) const {
+  const std::filesystem::path path = ServerFile(start.region);
+  std::error_code error;
+  std::filesystem::create_directories(path.parent_path(), error);
+  return WriteFile(path, absl::StrCat(start.region, " ", start.incarnation, " ", pid, " ", start.token, "\n"), 0600);
+}
+
+absl::StatusOr<std::vector<ServerStart>> LocalAllocator::Adopt() {
+  std::vector<ServerStart> out;
+  if (!options_.outlive) return out;
+  if (absl::Status s = Prepare(); !s.ok()) return s;
+  std::error_code error;
+  for (const auto& entry : std::filesystem::directory_iterator(options_.data_directory, error)) {
+    if (entry.path().extension() != ".server") continue;
+    std::ifstream in(entry.path());
+    ServerStart server;
+    Child child;
+    if (!(in >> server.region >> server.incarnation >> child.pid >> server.token)) continue;
+    // The number may be another process's by now; what it was started with tells.
+    child.pid_fd = static_cast<int>(syscall(SYS_pidfd_open, child.pid, 0));
+    if (child.pid_fd < 0) continue;
+    std::ifstream words(absl::StrCat("/proc/", child.pid, "/cmdline"), std::ios::binary);
+    const std::string started_with(std::istreambuf_iterator<char>(words), {});
+    if (!absl::StrContains(started_with, server.token)) {
+      close(child.pid_fd);
+      continue;
+    }
+    child.region = server.region;
+    child.incarnation = server.incarnation;
+    children_.push_back(child);
+    const auto size = std::filesystem::file_size(LogFile(server.region), error);
+    logs_.push_back({server.region, error ? 0 : static_cast<std::streamoff>(size)});
+    out.push_back(std::move(server));
+  }
+  return out;
+}
+
+void LocalAllocator::Release() {
+  for (const Child& child : children_) {
+    if (child.pid_fd >= 0) close(child.pid_fd);
+  }
+  children_.clear();
+}
+
 std::vector<pid_t> LocalAllocator::pids() const {
   std::vector<pid_t> out;
   for (const Child& child : children_) out.push_back(child.pid);
@@ -88,6 +150,7 @@ absl::Status LocalAllocator::Prepare() {
     return absl::NotFoundError(absl::StrCat("no region server at ", options_.executable.string(), ": ",
                                             std::strerror(errno), "; build the target aureole-region"));
   }
+  if (!logs_.empty()) return absl::OkStatus();
   std::error_code error;
   if (!options_.log_directory.empty()) {
     std::filesystem::create_directories(options_.log_directory, error);
@@ -106,9 +169,7 @@ absl::Status LocalAllocator::Prepare() {
 }
 
 absl::Status LocalAllocator::Start(const ServerStart& start) {
-  if (logs_.empty()) {
-    if (absl::Status s = Prepare(); !s.ok()) return s;
-  }
+  if (absl::Status s = Prepare(); !s.ok()) return s;
   const std::string executable = options_.executable.string();
   const std::string path = LogFile(start.region).string();
   const bool first = std::none_of(logs_.begin(), logs_.end(), [&](const Log& l) { return l.region == start.region; });
@@ -116,16 +177,9 @@ absl::Status LocalAllocator::Start(const ServerStart& start) {
   if (log < 0) return absl::InternalError(absl::StrCat("cannot write ", path, ": ", std::strerror(errno)));
   const int null = open("/dev/null", O_RDONLY | O_CLOEXEC);
 
-  const std::filesystem::path& data =
-      options_.data_directory.empty() ? options_.log_directory : options_.data_directory;
-  std::vector<std::string> words = {executable,
-                                    "--control",
-                                    start.control,
-                                    "--token",
-                                    start.token,
-                                    "--data",
-                                    (data / absl::StrCat("region-", start.region)).string(),
-                                    "--exit-with-parent"};
+  std::vector<std::string> words = {
+      executable, "--control", start.control, "--token", start.token, "--data", DataOf(start.region).string()};
+  if (!options_.outlive) words.emplace_back("--exit-with-parent");
   words.insert(words.end(), options_.flags.begin(), options_.flags.end());
   if (!start.listen.empty()) words.insert(words.end(), {"--listen", start.listen});
   std::vector<char*> arguments;
@@ -134,7 +188,7 @@ absl::Status LocalAllocator::Start(const ServerStart& start) {
 
   const pid_t parent = getpid();
   const pid_t pid = fork();
-  if (pid == 0) RunChild(executable.c_str(), arguments.data(), log, null, parent);
+  if (pid == 0) RunChild(executable.c_str(), arguments.data(), log, null, parent, options_.outlive);
   const int fork_error = errno;
   close(log);
   close(null);
@@ -145,19 +199,23 @@ absl::Status LocalAllocator::Start(const ServerStart& start) {
   setpgid(pid, pid);  // in both processes, so that Kill never comes too early for the group
   children_.push_back({start.region, start.incarnation, pid});
   if (first) logs_.push_back({start.region, 0});
-  return absl::OkStatus();
+  // One that nobody can find again is not let in again: its token is forgotten with this process.
+  return options_.outlive ? WriteServerFile(start, pid) : absl::OkStatus();
 }
 
 std::vector<ServerExit> LocalAllocator::Poll() {
   std::vector<ServerExit> exits;
   for (size_t i = 0; i < children_.size();) {
+    Child& child = children_[i];
     int status = 0;
-    const pid_t got = waitpid(children_[i].pid, &status, WNOHANG);
-    if (got == 0) {
+    pollfd ended{child.pid_fd, POLLIN, 0};
+    const bool gone = child.pid_fd >= 0 ? poll(&ended, 1, 0) > 0 : waitpid(child.pid, &status, WNOHANG) != 0;
+    if (!gone) {
       ++i;
       continue;
     }
-    exits.push_back(Describe(children_[i], got < 0 ? 0 : status));
+    exits.push_back(Describe(child, status));
+    if (child.pid_fd >= 0) close(child.pid_fd);
     children_.erase(children_.begin() + static_cast<std::ptrdiff_t>(i));
   }
   RepeatLogs();
@@ -168,7 +226,10 @@ ServerExit LocalAllocator::Describe(const Child& child, int wait_status) {
   ServerExit exit;
   exit.region = child.region;
   exit.incarnation = child.incarnation;
-  if (WIFSIGNALED(wait_status)) {
+  if (child.pid_fd >= 0) {
+    exit.clean = true;  // only its parent could tell
+    exit.how = "ended; how is not known, since an earlier control plane had started it";
+  } else if (WIFSIGNALED(wait_status)) {
     const int number = WTERMSIG(wait_status);
     exit.how = absl::StrCat("killed by signal ", number, " (", strsignal(number), ")");
   } else {
@@ -191,12 +252,16 @@ void LocalAllocator::End(RegionId region, uint64_t incarnation) {
 
 void LocalAllocator::Kill() {
   for (const Child& child : children_) kill(-child.pid, SIGKILL);
-  for (const Child& child : children_) {
-    while (waitpid(child.pid, nullptr, 0) < 0 && errno == EINTR) {
-    }
-  }
-  children_.clear();
+  for (const Child& child : children_) Await(child);
+  Release();
   RepeatLogs();
+}
+
+// Until it is gone.
+void LocalAllocator::Await(const Child& child) {
+  pollfd ended{child.pid_fd, POLLIN, 0};
+  while ((child.pid_fd >= 0 ? poll(&ended, 1, -1) : waitpid(child.pid, nullptr, 0)) < 0 && errno == EINTR) {
+  }
 }
 
 void LocalAllocator::RepeatLogs() {

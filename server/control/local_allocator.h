@@ -12,7 +12,8 @@
 namespace aureole {
 
 // Every server is a child in a process group of its own, so that Ctrl-C reaches only the parent, which then stops them
-// in order. The kernel kills them when the thread that started them ends, however it ends: keep that thread alive.
+// in order. Unless they outlive this process, the kernel kills them when the thread that started them ends, however it
+// ends: keep that thread alive.
 class LocalAllocator final : public Allocator {
  public:
   struct Options {
@@ -27,12 +28,17 @@ class LocalAllocator final : public Allocator {
     std::filesystem::path data_directory = {};
     // Further flags of every server, such as --tls DIR.
     std::vector<std::string> flags = {};
+    // Servers go on when this process dies; the next allocator with this data directory adopts them. Needs both
+    // directories. A file region-N.server beside the data of region N says which process it is, and its token.
+    bool outlive = false;
   };
   explicit LocalAllocator(Options options);
   ~LocalAllocator() override;
   LocalAllocator(const LocalAllocator&) = delete;
   LocalAllocator& operator=(const LocalAllocator&) = delete;
 
+  absl::StatusOr<std::vector<ServerStart>> Adopt() override;
+  void Release() override;
   absl::Status Start(const ServerStart& start) override;
   std::vector<ServerExit> Poll() override;
   int running() const override { return static_cast<int>(children_.size()); }
@@ -48,12 +54,17 @@ class LocalAllocator final : public Allocator {
     RegionId region = kNoRegion;
     uint64_t incarnation = 1;
     pid_t pid = 0;
+    int pid_fd = -1;  // of one that is not our child
   };
   struct Log {
     RegionId region = kNoRegion;
     std::streamoff shown = 0;  // bytes already repeated on stderr
   };
   absl::Status Prepare();
+  std::filesystem::path DataOf(RegionId region) const;
+  std::filesystem::path ServerFile(RegionId region) const;
+  absl::Status WriteServerFile(const ServerStart& start, pid_t pid) const;
+  static void Await(const Child& child);
   void RepeatLogs();
   ServerExit Describe(const Child& child, int wait_status);
 

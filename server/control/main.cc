@@ -1,7 +1,9 @@
 // aureole-control: the control plane as a process of its own, with region servers as local processes. It logs plain
 // lines; `aureole up` is the same with a table.
 #include <CLI/CLI.hpp>
+#include <filesystem>
 #include <iostream>
+#include <memory>
 #include <optional>
 
 #include <absl/strings/str_format.h>
@@ -10,6 +12,7 @@
 #include "server/control/interrupts.h"
 #include "server/control/local_allocator.h"
 #include "server/control/run.h"
+#include "server/control/sqlite_store.h"
 #include "server/control/world_file.h"
 
 namespace {
@@ -24,7 +27,7 @@ int main(int argc, char** argv) {
   app.footer(
       "Example:\n  aureole-control tests/worlds/demo.json --listen 127.0.0.1:7000\n\n"
       "Exit codes: 0 it ran, 1 the run failed, 2 bad input (then nothing was started).");
-  std::string world_path, duration;
+  std::string world_path, duration, store_path;
   double checkpoint_s = 1;
   aureole::RunOptions options;
   aureole::LocalAllocator::Options servers;
@@ -41,6 +44,10 @@ int main(int argc, char** argv) {
   app.add_option("--checkpoint-every", checkpoint_s, "Seconds of simulated time between checkpoints; 0 for none")
       ->check(CLI::Range(0.0, 3600.0))
       ->capture_default_str();
+  app.add_option("--store", store_path,
+                 "File of what is known of the world. With it the region servers go on when this process ends by "
+                 "anything but Ctrl-C, and the next one with the same store joins them; logs and checkpoints are "
+                 "beside it when not given");
   app.add_option("--tls", options.security.tls,
                  "Directory with ca.crt, tls.crt and tls.key, for this and the servers; plain text when not given");
   app.add_option("--tokens", options.security.tokens, "File of the tokens that clients need; none when not given");
@@ -69,6 +76,26 @@ int main(int argc, char** argv) {
 
   if (checkpoint_s > 0) options.checkpoint_every = aureole::TicksIn(checkpoint_s, tick_us);
 
+  std::unique_ptr<aureole::SqliteStore> store;
+  if (!store_path.empty()) {
+    if (options.checkpoint_every == 0) {
+      std::cerr << "--store: servers that go on by themselves need checkpoints; leave --checkpoint-every as it is\n";
+      return kBadInput;
+    }
+    absl::StatusOr<std::unique_ptr<aureole::SqliteStore>> opened = aureole::SqliteStore::Open(store_path);
+    if (!opened.ok()) {
+      std::cerr << "--store: " << opened.status().message() << '\n';
+      return kFailed;
+    }
+    store = *std::move(opened);
+    const std::filesystem::path beside = std::filesystem::absolute(store_path).parent_path();
+    if (servers.log_directory.empty()) servers.log_directory = beside / "logs";
+    if (servers.data_directory.empty()) servers.data_directory = beside / "data";
+    servers.outlive = true;
+    options.store = store.get();
+    options.control_epoch = store->epoch();
+    options.leave = &aureole::Terminated();
+  }
   servers.verbose = true;
   servers.flags = aureole::FlagsOf(options.security);
   options.security.log = [](const std::string& what) { std::cerr << "[control] " << what << '\n'; };
@@ -77,19 +104,26 @@ int main(int argc, char** argv) {
   aureole::Stage stage = aureole::Stage::kFinished;
   const absl::Status status = aureole::RunWorld(
       options, allocator,
-      [&stage](const aureole::RunStatus& now) {
+      [&](const aureole::RunStatus& now) {
         if (now.stage != stage) {
-          constexpr const char* kNames[] = {"starting", "loading", "running", "finished"};
+          constexpr const char* kNames[] = {"starting", "loading", "ready", "running", "finished"};
           std::cerr << "[control] " << kNames[static_cast<int>(now.stage)] << ", " << now.regions.size()
                     << " regions\n";
           stage = now.stage;
         }
-        return aureole::Interrupts() == 0;
+        return aureole::Interrupts() == 0 || (options.leave != nullptr && aureole::Terminated());
       },
       &result,
-      [](const aureole::RunEvent& event) {
+      [&store](const aureole::RunEvent& event) {
         std::cerr << "[control] region " << event.region << ": " << event.what << '\n';
+        if (store == nullptr) return;
+        if (absl::Status s = store->Append(event); !s.ok()) std::cerr << "[control] " << s.message() << '\n';
       });
+  if (aureole::Terminated() && store != nullptr && absl::IsCancelled(status)) {
+    std::cerr << "[control] left; " << result.status.regions.size() << " servers go on; start it again with --store "
+              << store_path << '\n';
+    return kOk;
+  }
   if (!status.ok() && !absl::IsCancelled(status)) {
     std::cerr << "[control] " << status.message() << '\n';
     return kFailed;

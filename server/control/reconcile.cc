@@ -14,6 +14,7 @@ std::string Lost(const RegionObserved& r, bool recovers) {
   if (r.joined && !r.connected && r.silent_s > kExitAfterLeaveSeconds) return "its stream ended";
   if (recovers && r.joined && r.silent_s > kLeaseSeconds)
     return absl::StrFormat("nothing heard of it for %.1f s", r.silent_s);
+  if (r.adopted && !r.joined && r.silent_s > kRejoinSeconds) return "it has not joined again";
   return "";
 }
 

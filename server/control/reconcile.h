@@ -21,6 +21,7 @@ struct RegionObserved {
   double down_s = 0;         // not alive: since it ended
   int failures = 0;          // servers in a row that ended without getting the region further than it was before
   std::string how;           // not alive: how it ended
+  bool adopted = false;      // an earlier control plane started it: it knows where to join again
 };
 
 struct Observed {
@@ -41,9 +42,9 @@ struct Action {
   std::string why;
 };
 
-// A server whose stream has ended, or that says nothing for so long, is replaced. Far above what a server that is
-// stopped for a moment, or pages, needs.
-inline constexpr double kExitAfterLeaveSeconds = 3, kLeaseSeconds = 6;
+// A server whose stream has ended, or that says nothing for so long, is replaced; so is one that an earlier control
+// plane has left and that does not join again. Far above what a server that is stopped for a moment, or pages, needs.
+inline constexpr double kExitAfterLeaveSeconds = 3, kLeaseSeconds = 6, kRejoinSeconds = 10;
 // Servers of one region that may end in a row without getting further before the run gives up (P74), and the wait
 // before the next one after n of them: 0.1 s, doubled each time, at most 10 s.
 inline constexpr int kMostFailures = 6;

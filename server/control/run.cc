@@ -4,6 +4,7 @@
 #include <grpcpp/grpcpp.h>
 
 #include <memory>
+#include <optional>
 #include <random>
 
 #include <absl/strings/match.h>
@@ -14,6 +15,7 @@
 
 #include "server/control/interrupts.h"
 #include "server/control/reconcile.h"
+#include "server/transport/world_spec.h"
 
 namespace aureole {
 namespace {
@@ -22,10 +24,15 @@ using Clock = std::chrono::steady_clock;
 
 constexpr std::chrono::milliseconds kPollEvery{50};
 constexpr std::chrono::milliseconds kObserveEvery{100};
+constexpr std::chrono::milliseconds kStartDelay{300};  // from the last Ready to tick 0
 
 std::string MakeToken() {
   std::random_device random;
   return absl::StrFormat("%08x%08x%08x%08x", random(), random(), random(), random());
+}
+
+int64_t UnixUs(std::chrono::system_clock::time_point t) {
+  return std::chrono::duration_cast<std::chrono::microseconds>(t.time_since_epoch()).count();
 }
 
 double Seconds(Clock::duration d) { return std::chrono::duration<double>(d).count(); }
@@ -47,11 +54,18 @@ class Runner {
       : options_(options), allocator_(allocator), on_event_(on_event) {}
 
   absl::Status Run(const RunObserver& observe, RunResult* result) {
-    absl::Status s = Serve();
+    absl::Status s = Prepare();
+    if (s.ok()) s = Serve();
     if (s.ok()) s = Watch(observe);
-    const absl::Status end = StopAll(s.ok() ? "the run is over" : std::string(s.message()));
-    if (s.ok()) s = end;
-    allocator_.Kill();
+    if (leaves_) {
+      allocator_.Release();
+    } else {
+      const absl::Status end = StopAll(s.ok() ? "the run is over" : std::string(s.message()));
+      if (s.ok()) s = end;
+      allocator_.Kill();
+    }
+    if (options_.hub != nullptr) options_.hub->Remove(options_.world_name);
+    if (service_ != nullptr) service_->Close();
     if (server_ != nullptr) server_->Shutdown(std::chrono::system_clock::now() + std::chrono::seconds(1));
     if (service_ != nullptr) {
       result->status = service_->Status();
@@ -71,6 +85,7 @@ class Runner {
   struct Server {
     uint64_t incarnation = 0;
     bool alive = false;
+    bool adopted = false;  // an earlier control plane has started it
     Clock::time_point ended;
     Tick furthest = 0;            // that any server of it had reported when it ended
     int failures = 0;             // in a row, without getting further
@@ -79,20 +94,66 @@ class Runner {
     bool port_lost = false;       // it could not even listen
   };
 
+  // What an earlier control plane has left.
+  absl::Status Prepare() {
+    const int regions = options_.undivided ? 1 : options_.regions;
+    servers_.resize(static_cast<size_t>(regions));
+    plan_regions_.resize(servers_.size());
+    const auto now = Clock::now();
+    for (Server& server : servers_) server.ended = now;
+    record_.set_world_hash(WorldHash(options_.world));
+    for (int i = 0; i < regions; ++i) record_.add_regions();
+    if (options_.store == nullptr) return absl::OkStatus();
+    leaves_ = true;  // whatever runs must not suffer from what is found
+    absl::StatusOr<std::optional<v1::WorldRecord>> found = options_.store->Load();
+    if (!found.ok()) return found.status();
+    if (found->has_value()) {
+      if ((*found)->world_hash() != record_.world_hash() || (*found)->regions_size() != regions) {
+        return absl::FailedPreconditionError(
+            "the store has another world, which may still run; take another store, or the world that it was made for");
+      }
+      record_ = **std::move(found);
+    }
+    absl::StatusOr<std::vector<ServerStart>> adopted = allocator_.Adopt();
+    if (!adopted.ok()) return adopted.status();
+    leaves_ = false;
+    for (size_t i = 0; i < servers_.size(); ++i) {
+      const v1::RegionRecord& from = record_.regions(static_cast<int>(i));
+      servers_[i].incarnation = from.incarnation();
+      servers_[i].exit.how = "it has ended while no control plane was there";
+      plan_regions_[i].incarnation = std::max<uint64_t>(1, from.incarnation());
+      plan_regions_[i].was_ready = from.was_ready();
+      plan_regions_[i].endpoint = from.endpoint();
+    }
+    for (const ServerStart& server : *adopted) {
+      const auto i = static_cast<size_t>(server.region);
+      if (server.region < 0 || server.region >= regions || server.incarnation != servers_[i].incarnation) {
+        allocator_.End(server.region, server.incarnation);
+        continue;
+      }
+      servers_[i].alive = servers_[i].adopted = true;
+      plan_regions_[i].token = server.token;
+    }
+    return absl::OkStatus();
+  }
+
   absl::Status Serve() {
     RunPlan plan;
     plan.world = options_.world;
-    const int regions = options_.undivided ? 1 : options_.regions;
-    for (int i = 0; i < regions; ++i) plan.tokens.push_back(MakeToken());
+    plan.regions = plan_regions_;
+    plan.control_epoch = options_.control_epoch;
+    plan.start_unix_us = record_.start_unix_us();
     plan.undivided = options_.undivided;
     plan.no_real_time = options_.no_real_time;
     plan.last_tick = options_.last_tick;
     plan.hash_every = options_.hash_every;
     plan.checkpoint_every = options_.checkpoint_every;
     service_ = std::make_unique<ControlService>(plan);
-    tokens_ = plan.tokens;
-    servers_.resize(static_cast<size_t>(regions));
-
+    if (options_.hub != nullptr) {
+      options_.hub->Add(options_.world_name, service_.get());
+      address_ = options_.advertise;
+      return absl::OkStatus();
+    }
     absl::StatusOr<std::unique_ptr<Security>> security = Security::Open(options_.security);
     if (!security.ok()) return security.status();
     security_ = *std::move(security);
@@ -102,13 +163,18 @@ class Runner {
     grpc::ServerBuilder builder;
     int port = 0;
     builder.AddChannelArgument(GRPC_ARG_ALLOW_REUSEPORT, 0);  // else a second control plane would share the port
-    security_->Listen(&builder, options_.listen, &port);
+    // Servers that run look for it where it was.
+    const bool any = absl::EndsWith(options_.listen, ":0") && !record_.control().empty();
+    const std::string listen = any ? record_.control() : options_.listen;
+    security_->Listen(&builder, listen, &port);
     security_->guard().Register(&builder, v1::Control::service_full_name(), service_.get());
     server_ = builder.BuildAndStart();
     if (server_ == nullptr || port == 0) {
-      return absl::UnavailableError(absl::StrCat("cannot listen on ", options_.listen, "; is the port in use?"));
+      leaves_ = options_.store != nullptr;
+      return absl::UnavailableError(absl::StrCat("cannot listen on ", listen, "; is the port in use?"));
     }
-    address_ = absl::StrCat(options_.listen.substr(0, options_.listen.rfind(':')), ":", port);
+    address_ = absl::StrCat(listen.substr(0, listen.rfind(':')), ":", port);
+    record_.set_control(address_);
     return absl::OkStatus();
   }
 
@@ -116,9 +182,14 @@ class Runner {
     const auto started = Clock::now();
     auto next_observe = started;
     for (;;) {
+      if (options_.leave != nullptr && *options_.leave) {
+        leaves_ = true;
+        return absl::CancelledError("left; the servers go on");
+      }
       TakeExits();
       const RunStatus status = service_->Status();
       TellOfStorage(status);
+      if (absl::Status s = Keep(status); !s.ok()) return s;
       if (absl::Status s = Act(status); !s.ok()) return s;
       const auto now = Clock::now();
       if (status.stage >= Stage::kRunning && !running_) {
@@ -167,9 +238,10 @@ class Runner {
       const RegionStatus& r = status.regions[i];
       // Who loads a world has nothing to say.
       const bool talks = r.ready && status.stage == Stage::kRunning && !r.finished;
+      const bool joins = server.adopted && !r.joined;
       out.regions.push_back({server.incarnation, server.alive, r.joined, r.joined && !r.left, r.finished,
-                             server.exit.clean, talks || r.left ? Seconds(now - r.reported) : 0,
-                             Seconds(now - server.ended), server.failures, server.exit.how});
+                             server.exit.clean, talks || joins || r.left ? Seconds(now - r.reported) : 0,
+                             Seconds(now - server.ended), server.failures, server.exit.how, server.adopted});
     }
     return out;
   }
@@ -202,10 +274,13 @@ class Runner {
 
   absl::Status Start(const Action& a) {
     Server& server = servers_[static_cast<size_t>(a.region)];
-    std::string token = tokens_[static_cast<size_t>(a.region)], listen;
+    const std::string token = MakeToken();
+    std::string listen;
+    service_->Expect(a.region, a.incarnation, token);
+    // Before it is started: no two servers may ever have one incarnation.
+    record_.mutable_regions(a.region)->set_incarnation(a.incarnation);
+    if (absl::Status s = Save(); !s.ok()) return s;
     if (a.incarnation > 1) {
-      token = MakeToken();
-      service_->Expect(a.region, a.incarnation, token);
       // Clients look for it there, unless another program has taken the port.
       if (!server.port_lost) listen = service_->Status().regions[static_cast<size_t>(a.region)].endpoint;
       Tell(a.region, absl::StrCat("incarnation ", a.incarnation, " is started: ", a.why));
@@ -213,8 +288,39 @@ class Runner {
     if (absl::Status s = allocator_.Start({a.region, a.incarnation, token, address_, listen}); !s.ok()) return s;
     server.incarnation = a.incarnation;
     server.alive = true;
+    server.adopted = false;
     server.exit = {};
     return absl::OkStatus();
+  }
+
+  // What the next control plane must know, before anything depends on it.
+  absl::Status Keep(const RunStatus& status) {
+    bool changed = false;
+    for (size_t i = 0; i < servers_.size(); ++i) {
+      v1::RegionRecord* const to = record_.mutable_regions(static_cast<int>(i));
+      const RegionStatus& from = status.regions[i];
+      changed |= to->was_ready() != from.was_ready || to->endpoint() != from.endpoint;
+      to->set_was_ready(from.was_ready);
+      to->set_endpoint(from.endpoint);
+    }
+    const bool starts = status.stage == Stage::kReady;
+    int64_t start = status.start_unix_us;
+    if (starts) start = UnixUs(std::chrono::system_clock::now() + kStartDelay);
+    changed |= record_.start_unix_us() != start;
+    record_.set_start_unix_us(start);
+    if (changed) {
+      if (absl::Status s = Save(); !s.ok()) return s;
+    }
+    if (starts) service_->StartAll(start);
+    return absl::OkStatus();
+  }
+
+  absl::Status Save() {
+    if (options_.store == nullptr) return absl::OkStatus();
+    absl::Status s = options_.store->Save(record_);
+    // Without the store this control plane must not act any more; another one may.
+    if (!s.ok()) leaves_ = true;
+    return s;
   }
 
   // A region that cannot write goes on; if it dies then, what it did since its last checkpoint may be lost.
@@ -258,8 +364,10 @@ class Runner {
   std::unique_ptr<ControlService> service_;
   std::unique_ptr<grpc::Server> server_;  // ends before the service
   std::string address_;
-  std::vector<std::string> tokens_;  // of the first servers
-  std::vector<Server> servers_;      // by region
+  v1::WorldRecord record_;
+  std::vector<RunPlan::Region> plan_regions_;
+  std::vector<Server> servers_;  // by region
+  bool leaves_ = false;          // the servers go on without this control plane
   bool running_ = false;
   Clock::time_point running_since_, ended_;
 };

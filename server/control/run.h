@@ -2,6 +2,7 @@
 // and aureole-control have in common.
 #pragma once
 
+#include <atomic>
 #include <chrono>
 #include <functional>
 #include <string>
@@ -10,8 +11,10 @@
 #include <absl/status/status.h>
 
 #include "server/control/allocator.h"
+#include "server/control/control_hub.h"
 #include "server/control/control_service.h"
 #include "server/control/run_status.h"
+#include "server/control/world_store.h"
 #include "server/transport/security.h"
 
 namespace aureole {
@@ -27,6 +30,15 @@ struct RunOptions {
   // bit; 0: the run ends with the first server that does.
   Tick checkpoint_every = 0;
   std::string listen = "127.0.0.1:0";
+  // Servers join at this hub's port instead, which they dial at `advertise`, host:port, with `world_name`.
+  ControlHub* hub = nullptr;
+  std::string advertise = {}, world_name = {};
+  // Kept there, the run outlives this control plane: the one that calls RunWorld next with the same store and world
+  // finds the servers that still run, replaces those that do not, and goes on. Outlives the run.
+  WorldStore* store = nullptr;
+  uint64_t control_epoch = 1;  // grows with each control plane of the world; servers obey no lower one
+  // Once it is true, RunWorld returns and the servers go on without a control plane. Needs a store.
+  const std::atomic<bool>* leave = nullptr;
   SecurityOptions security;                // of what listens here; the servers are started with theirs
   std::chrono::seconds join_timeout{120};  // from the start of the servers to the last Ready
   std::chrono::seconds stop_timeout{10};   // from Stop to the end of the last server, which is then killed
@@ -46,12 +58,13 @@ using EventObserver = std::function<void(const RunEvent&)>;
 // Called about ten times a second, on the caller's thread; false interrupts the run.
 using RunObserver = std::function<bool(const RunStatus&)>;
 
-// Runs until every region has finished, the observer says so, or something fails; in every case no server is left when
-// it returns; a second interrupt (interrupts.h) makes short work of servers that take their time. `result` holds what
-// was reported until then. Cancelled: the observer ended it. Aborted: a server ended or left before its time and could
-// not be replaced; the message names the region, how it ended and the tail of its log. DeadlineExceeded: the servers
-// did not join, or did not end, in time. Unavailable: the control plane's port cannot be opened; or
-// what Security says: it must not be.
+// Runs until every region has finished, the observer says so, or something fails; in every case but `leave`, and the
+// loss of the store, no server is left when it returns; a second interrupt (interrupts.h) makes short work of servers
+// that take their time. `result` holds what was reported until then. Cancelled: the observer ended it. Aborted: a
+// server ended or left before its time and could not be replaced; the message names the region, how it ended and the
+// tail of its log. DeadlineExceeded: the servers did not join, or did not end, in time. Unavailable: the control
+// plane's port cannot be opened; or what Security says: it must not be. FailedPrecondition: the store has another
+// world. Aborted, Unavailable, DataLoss: the store's; the servers go on.
 absl::Status RunWorld(const RunOptions& options, Allocator& allocator, const RunObserver& observe, RunResult* result,
                       const EventObserver& on_event = nullptr);
 

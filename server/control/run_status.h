@@ -15,6 +15,7 @@ namespace aureole {
 enum class Stage : uint8_t {
   kJoining,   // not all servers have said Hello
   kLoading,   // not all servers are Ready
+  kReady,     // all are
   kRunning,   // Start was sent
   kFinished,  // every server has reported its last tick
 };
@@ -22,8 +23,9 @@ enum class Stage : uint8_t {
 struct RegionStatus {
   uint64_t incarnation = 1;  // of the server that is expected, or here
   bool joined = false, ready = false, finished = false;
-  bool left = false;    // its stream has ended
-  std::string goodbye;  // the reason it gave, if any
+  bool was_ready = false;  // this server or an earlier one: there is a checkpoint
+  bool left = false;       // its stream has ended
+  std::string goodbye;     // the reason it gave, if any
   std::string endpoint, metrics_endpoint;
   int64_t pid = 0;
   // The newest report, without its hashes, windows and violations. Before the first one: `bodies` of its Ready.
@@ -50,6 +52,7 @@ struct RunEvent {
 
 struct RunStatus {
   Stage stage = Stage::kJoining;
+  int64_t start_unix_us = 0;  // wall time of tick 0; 0: not known yet
   std::vector<RegionStatus> regions;
 
   Tick MinTick() const;

@@ -9,6 +9,12 @@
 #include "server/transport/server_certificate.h"
 
 namespace aureole {
+namespace {
+
+// Of a call to Control.Join (control.proto).
+constexpr char kWorldMetadata[] = "aureole-world";
+
+}  // namespace
 
 void EventQueue::Push(Event event) {
   {
@@ -26,15 +32,35 @@ Event EventQueue::Pop() {
   return event;
 }
 
-ControlStream::ControlStream(const std::string& address, const std::shared_ptr<grpc::ChannelCredentials>& credentials,
-                             v1::Hello hello, EventQueue* events)
-    : events_(events) {
+bool EventQueue::PopUntil(std::chrono::steady_clock::time_point deadline, Event* event) {
+  std::unique_lock lock(mutex_);
+  if (!pushed_.wait_until(lock, deadline, [this] { return !events_.empty(); })) return false;
+  *event = std::move(events_.front());
+  events_.pop_front();
+  return true;
+}
+
+ControlChannel::ControlChannel(const std::string& address, const std::shared_ptr<grpc::ChannelCredentials>& credentials,
+                               std::string world)
+    : world_(std::move(world)) {
   grpc::ChannelArguments arguments;
   arguments.SetInt(GRPC_ARG_ENABLE_HTTP_PROXY, 0);
   arguments.SetSslTargetNameOverride(kServerName);
   arguments.SetMaxReceiveMessageSize(limits::kMaxWorldFileBytes);  // an assignment holds the whole world
+  // Who lost its control plane wants the next one soon.
+  arguments.SetInt(GRPC_ARG_INITIAL_RECONNECT_BACKOFF_MS, 200);
+  arguments.SetInt(GRPC_ARG_MIN_RECONNECT_BACKOFF_MS, 500);
+  arguments.SetInt(GRPC_ARG_MAX_RECONNECT_BACKOFF_MS, 1000);
+  // The machine of the control plane may have gone without a word.
+  arguments.SetInt(GRPC_ARG_KEEPALIVE_TIME_MS, 5000);
+  arguments.SetInt(GRPC_ARG_KEEPALIVE_TIMEOUT_MS, 5000);
+  arguments.SetInt(GRPC_ARG_HTTP2_MAX_PINGS_WITHOUT_DATA, 0);
   stub_ = v1::Control::NewStub(grpc::CreateCustomChannel(address, credentials, arguments));
-  stub_->async()->Join(&context_, this);
+}
+
+ControlStream::ControlStream(ControlChannel* channel, v1::Hello hello, EventQueue* events) : events_(events) {
+  if (!channel->world_.empty()) context_.AddMetadata(kWorldMetadata, channel->world_);
+  channel->stub_->async()->Join(&context_, this);
   AddHold();  // writes come from outside of gRPC's callbacks; released when nothing is read any more
   StartRead(&in_);
   v1::FromRegion first;
@@ -49,11 +75,12 @@ ControlStream::~ControlStream() {
   done_changed_.wait(lock, [this] { return done_; });
 }
 
-void ControlStream::Send(v1::FromRegion message) {
+bool ControlStream::Send(v1::FromRegion message) {
   const std::lock_guard lock(mutex_);
-  if (ended_ || closing_) return;
+  if (ended_ || closing_) return false;
   queue_.push_back(std::move(message));
   Pump();
+  return true;
 }
 
 void ControlStream::Close(const std::string& reason) {
@@ -108,6 +135,17 @@ void ControlStream::OnDone(const grpc::Status& status) {
   Event event;
   event.kind = Event::Kind::kControlLost;
   event.reason = status.ok() ? "the control plane has ended the stream" : status.error_message();
+  switch (status.error_code()) {
+    case grpc::StatusCode::INVALID_ARGUMENT:
+    case grpc::StatusCode::FAILED_PRECONDITION:
+    case grpc::StatusCode::ALREADY_EXISTS:
+    case grpc::StatusCode::UNAUTHENTICATED:
+    case grpc::StatusCode::PERMISSION_DENIED:
+      event.refused = true;
+      break;
+    default:
+      break;
+  }
   events_->Push(std::move(event));
   const std::lock_guard lock(mutex_);
   done_ = true;

@@ -2,6 +2,7 @@
 // thread waits on.
 #pragma once
 
+#include <chrono>
 #include <condition_variable>
 #include <deque>
 #include <memory>
@@ -19,7 +20,8 @@ struct Event {
   enum class Kind { kMessage, kControlLost, kSignal };
   Kind kind = Kind::kMessage;
   v1::ToRegion message;
-  std::string reason;  // why the stream ended
+  std::string reason;    // why the stream ended
+  bool refused = false;  // by a control plane that will not have this server: there is no use in coming again
   int signal = 0;
 };
 
@@ -29,6 +31,8 @@ class EventQueue {
   void Push(Event event);
   // Waits for the next.
   Event Pop();
+  // At most until `deadline`; nothing came: false.
+  bool PopUntil(std::chrono::steady_clock::time_point deadline, Event* event);
 
  private:
   std::mutex mutex_;
@@ -36,17 +40,31 @@ class EventQueue {
   std::deque<Event> events_;
 };
 
+// Connections to one control plane address, over which streams are opened one after another.
+class ControlChannel {
+ public:
+  // `world`: which of the control plane's worlds the server is for; empty: its only one.
+  ControlChannel(const std::string& address, const std::shared_ptr<grpc::ChannelCredentials>& credentials,
+                 std::string world);
+
+ private:
+  friend class ControlStream;
+  const std::string world_;
+  std::unique_ptr<v1::Control::Stub> stub_;
+};
+
 // One Join stream. Messages and the end of the stream become events.
 class ControlStream final : public grpc::ClientBidiReactor<v1::FromRegion, v1::ToRegion> {
  public:
   // Starts to connect and says `hello`.
-  ControlStream(const std::string& address, const std::shared_ptr<grpc::ChannelCredentials>& credentials,
-                v1::Hello hello, EventQueue* events);
+  ControlStream(ControlChannel* channel, v1::Hello hello, EventQueue* events);
   // Cancels what is left and waits for the end.
   ~ControlStream() override;
 
-  // Any thread; never waits for the network. Dropped when the stream has ended.
-  void Send(v1::FromRegion message);
+  // Any thread; never waits for the network. False: dropped, since the stream has ended.
+  bool Send(v1::FromRegion message);
+  // Ends the stream soon, without a word. Any thread.
+  void Cancel() { context_.TryCancel(); }
   // Says goodbye after everything that was sent, and waits for the end of the stream, at most a second.
   void Close(const std::string& reason);
 
@@ -57,7 +75,6 @@ class ControlStream final : public grpc::ClientBidiReactor<v1::FromRegion, v1::T
   void Pump();
 
   EventQueue* const events_;
-  std::unique_ptr<v1::Control::Stub> stub_;
   grpc::ClientContext context_;
   v1::ToRegion in_;  // only touched by reads
 

@@ -127,6 +127,15 @@ void HostedRegion::Start(int64_t start_unix_us, TickLoop::Hooks hooks) {
   thread_ = std::thread([this] { loop_->Run(); });
 }
 
+HostedRegion::Progress HostedRegion::progress() const {
+  if (loop_ == nullptr) return {region_->tick(), region_->bodies()};
+  return {loop_->reported_tick(), loop_->reported_bodies()};
+}
+
+void HostedRegion::SayAgain() {
+  if (loop_ != nullptr) loop_->SayAgain();
+}
+
 void HostedRegion::Stop() {
   if (!thread_.joinable()) return;
   loop_->Stop();

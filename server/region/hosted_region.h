@@ -36,6 +36,14 @@ class HostedRegion {
   void Connect(PeerService* service, const std::shared_ptr<grpc::ChannelCredentials>& credentials);
   // Starts the tick thread. Once.
   void Start(int64_t start_unix_us, TickLoop::Hooks hooks);
+  struct Progress {
+    Tick tick = 0;  // last stepped
+    int64_t bodies = 0;
+  };
+  // As of the newest report. Any thread.
+  Progress progress() const;
+  // The next report says again what may not have been heard. Any thread.
+  void SayAgain();
   // The peer's next incarnation is there.
   void PeerMoved(const v1::PeerMoved& moved);
   // Ends the tick thread. Idempotent.

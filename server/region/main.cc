@@ -24,6 +24,8 @@ int main(int argc, char** argv) {
   bool exit_with_parent = false;
   app.add_option("--control", options.control, "host:port of the control plane");
   app.add_option("--token", options.token, "says which region this process was started for");
+  app.add_option("--world", options.world,
+                 "which of the control plane's worlds it is for; its only one when not given");
   app.add_option("--listen", options.listen, "host:port for peers and clients; port 0 is any")->capture_default_str();
   app.add_option("--metrics", options.metrics, "host:port of Prometheus /metrics, or off")->capture_default_str();
   app.add_option("--data", options.data, "directory for checkpoints, of this region alone; made when missing");

@@ -7,7 +7,10 @@
 #include <atomic>
 #include <chrono>
 #include <memory>
+#include <mutex>
+#include <optional>
 #include <thread>
+#include <utility>
 
 #include <absl/strings/str_cat.h>
 #include <grpcpp/ext/proto_server_reflection_plugin.h>
@@ -22,6 +25,7 @@
 #include "server/transport/peer_service.h"
 #include "server/transport/recording_service.h"
 #include "server/transport/simulation_service.h"
+#include "server/transport/world_spec.h"
 
 namespace aureole {
 namespace {
@@ -29,6 +33,9 @@ namespace {
 constexpr uint32_t kControlProtocolVersion = 1;
 // Leaving takes milliseconds. A process that is stuck in it is ended by the kernel, so that none is left behind.
 constexpr unsigned kLongestLeaveSeconds = 10;
+// Who has nothing to do yet does not wait longer than this for a control plane; the wait between two tries.
+constexpr std::chrono::seconds kLongestJoin{60};
+constexpr std::chrono::milliseconds kJoinAgainAfter{300};
 
 sigset_t TakenSignals() {
   sigset_t set;
@@ -106,12 +113,59 @@ struct Process {
   RecordingService recording;
   std::string data;
   std::unique_ptr<GrpcServer> server;
+  v1::Hello hello;
+  std::unique_ptr<ControlChannel> channel;
+  std::mutex control_mutex;  // guards what follows, but not its use by the main thread, which alone changes it
   std::unique_ptr<ControlStream> control;
+  std::optional<v1::Report> last_report;  // of a run that is over
   std::unique_ptr<HostedRegion> hosted;
+  uint64_t control_epoch = 0;  // the highest that was heard
+  bool control_lost = false;
+  int64_t start_unix_us = 0;  // 0: not started
+  std::chrono::steady_clock::time_point join_again = std::chrono::steady_clock::time_point::max();
+  std::chrono::steady_clock::time_point give_up_joining;
 
   TickLoop::Hooks Hooks();
   absl::Status Handle(const v1::ToRegion& message);
+  void Join();
+  bool Report(const v1::Report& report);
+  void SayLastReport();
 };
+
+// Opens a stream, with what this server runs.
+void Process::Join() {
+  join_again = std::chrono::steady_clock::time_point::max();
+  if (hosted != nullptr) {
+    v1::Running* running = hello.mutable_running();
+    running->set_region(hosted->assignment().region());
+    running->set_incarnation(hosted->assignment().incarnation());
+    running->set_world_hash(WorldHash(hosted->assignment().world()));
+    running->set_start_unix_us(start_unix_us);
+    const HostedRegion::Progress progress = hosted->progress();
+    running->set_tick(progress.tick);
+    running->set_bodies(progress.bodies);
+    hosted->SayAgain();
+  }
+  auto stream = std::make_unique<ControlStream>(channel.get(), hello, &events);
+  const std::lock_guard lock(control_mutex);
+  control = std::move(stream);
+  if (last_report.has_value()) SayLastReport();
+}
+
+// With the mutex.
+void Process::SayLastReport() {
+  v1::FromRegion message;
+  *message.mutable_report() = *last_report;
+  control->Send(std::move(message));
+}
+
+// The tick thread; false: nobody has heard it.
+bool Process::Report(const v1::Report& report) {
+  v1::FromRegion message;
+  *message.mutable_report() = report;
+  const std::lock_guard lock(control_mutex);
+  return control->Send(std::move(message));
+}
 
 TickLoop::Hooks Process::Hooks() {
   TickLoop::Hooks hooks;
@@ -132,15 +186,26 @@ TickLoop::Hooks Process::Hooks() {
     }
     simulation.Report(report);
     if (report.finished()) spdlog::info("finished at tick {}", report.tick());
-    v1::FromRegion message;
-    *message.mutable_report() = report;
-    control->Send(std::move(message));
+    return Report(report);
+  };
+  hooks.epilogue = [this](const v1::Report& report, bool heard) {
+    const std::lock_guard lock(control_mutex);
+    last_report = report;
+    if (!heard) SayLastReport();  // a new stream may have come since
   };
   hooks.log = [](const std::string& what) { spdlog::warn("{}", what); };
   return hooks;
 }
 
 absl::Status Process::Handle(const v1::ToRegion& message) {
+  if (message.control_epoch() < control_epoch) {
+    spdlog::warn("a control plane of epoch {} speaks after one of epoch {}: not obeyed", message.control_epoch(),
+                 control_epoch);
+    control->Cancel();  // its end is heard of, and another stream is opened
+    return absl::OkStatus();
+  }
+  control_epoch = message.control_epoch();
+  if (std::exchange(control_lost, false)) spdlog::info("a control plane of epoch {} is there", control_epoch);
   if (message.has_assignment()) {
     if (hosted != nullptr) return absl::FailedPreconditionError("a second assignment");
     const v1::Assignment& assignment = message.assignment();
@@ -164,9 +229,11 @@ absl::Status Process::Handle(const v1::ToRegion& message) {
     control->Send(std::move(ready));
   } else if (message.has_start()) {
     if (hosted == nullptr) return absl::FailedPreconditionError("a start without an assignment");
+    if (start_unix_us != 0) return absl::OkStatus();  // said again to who has joined again
+    start_unix_us = message.start().start_unix_us();
     simulation.Serve(hosted->assignment(), hosted->world());
     recording.Serve(hosted->assignment().region(), hosted->assignment().world(), hosted->world().exchange.k == 0);
-    hosted->Start(message.start().start_unix_us(), Hooks());
+    hosted->Start(start_unix_us, Hooks());
     server->SetServing(true);
   } else if (message.has_peer_moved()) {
     if (hosted == nullptr) return absl::FailedPreconditionError("a peer has moved before the assignment");
@@ -176,6 +243,21 @@ absl::Status Process::Handle(const v1::ToRegion& message) {
     hosted->PeerMoved(message.peer_moved());
   }
   return absl::OkStatus();
+}
+
+// What runs goes on without a control plane, unless it is one that will not have this server.
+bool ControlLost(Process* process, const Event& event, int* exit_code, std::string* reason) {
+  const auto now = std::chrono::steady_clock::now();
+  if (event.refused || (process->hosted == nullptr && now > process->give_up_joining)) {
+    *reason = "control plane lost: " + event.reason;
+    *exit_code = 1;
+    return false;
+  }
+  const auto level = std::exchange(process->control_lost, true) ? spdlog::level::debug : spdlog::level::warn;
+  spdlog::log(level, "control plane lost: {}; {} and joins again", event.reason,
+              process->hosted == nullptr ? "waits" : "goes on");
+  process->join_again = now + kJoinAgainAfter;
+  return true;
 }
 
 // True when the process should go on.
@@ -190,10 +272,7 @@ bool HandleEvent(Process* process, const Event& event, int* exit_code, std::stri
       *reason = strsignal(event.signal);
       return false;
     case Event::Kind::kControlLost:
-      *reason = "control plane lost: " + event.reason;
-      // Nobody to serve when there never was an assignment.
-      if (process->hosted == nullptr) *exit_code = 1;
-      return false;
+      return ControlLost(process, event, exit_code, reason);
     case Event::Kind::kMessage:
       break;
   }
@@ -254,7 +333,7 @@ int RunRegionServer(const RegionServerOptions& options) {
     spdlog::error("--listen: cannot listen on {}; choose another host:port, or port 0", options.listen);
     return 1;
   }
-  v1::Hello hello;
+  v1::Hello& hello = process.hello;
   hello.set_protocol_version(kControlProtocolVersion);
   hello.set_token(options.token);
   hello.set_endpoint(process.server->endpoint());
@@ -262,12 +341,19 @@ int RunRegionServer(const RegionServerOptions& options) {
   hello.set_pid(getpid());
   spdlog::info("aureole-region: pid {}, control {}, peers and clients {}, metrics {}", getpid(), options.control,
                process.server->endpoint(), process.metrics != nullptr ? process.metrics->endpoint() : "off");
-  process.control =
-      std::make_unique<ControlStream>(options.control, process.security->channel(), hello, &process.events);
+  process.channel = std::make_unique<ControlChannel>(options.control, process.security->channel(), options.world);
+  process.give_up_joining = std::chrono::steady_clock::now() + kLongestJoin;
+  process.Join();
 
   int exit_code = 0;
   std::string reason;
-  while (HandleEvent(&process, process.events.Pop(), &exit_code, &reason)) {
+  for (bool goes_on = true; goes_on;) {
+    Event event;
+    if (process.events.PopUntil(process.join_again, &event)) {
+      goes_on = HandleEvent(&process, event, &exit_code, &reason);
+    } else {
+      process.Join();
+    }
   }
   spdlog::log(exit_code == 0 ? spdlog::level::info : spdlog::level::err, "leaving: {}", reason);
   alarm(kLongestLeaveSeconds);

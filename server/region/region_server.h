@@ -13,6 +13,7 @@ struct RegionServerOptions {
   std::string listen = "127.0.0.1:0";   // for peers and clients
   std::string metrics = "127.0.0.1:0";  // Prometheus over HTTP; "off"
   std::string data;                     // directory for checkpoints; empty: none
+  std::string world;                    // which of the control plane's worlds; empty: its only one
   SecurityOptions security;             // its log is the server's
 };
 
@@ -20,7 +21,8 @@ struct RegionServerOptions {
 // before the first thread.
 void BlockSignals();
 
-// Serves until the control plane says Stop or goes away, or SIGTERM or SIGINT. SIGUSR1 cuts every link's connection
+// Serves until the control plane says Stop, or will not have it any more, or SIGTERM or SIGINT. Without a control plane
+// it goes on, and joins again when one is there; it waits a minute for the first. SIGUSR1 cuts every link's connection
 // once, for tests of the resumption. Returns the exit code: 0, or 1 when it could not listen, join or load the world,
 // which is logged.
 int RunRegionServer(const RegionServerOptions& options);

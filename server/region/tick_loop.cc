@@ -19,7 +19,9 @@ constexpr milliseconds kLongestSleep(100);  // so that Stop is heard
 // A world that is later than this, because a server was overloaded or dead, does not try to make it up: nobody wants to
 // watch the lost time run past.
 constexpr milliseconds kMostBehind(500);
-constexpr size_t kRecentHashes = 256;  // more than are made between two reports
+// More than are made while a control plane is replaced, and between two reports.
+constexpr size_t kRecentHashes = 4096, kCheckpointHashes = 256;
+constexpr int kMostUnsaid = 1024;
 
 double Ms(std::chrono::steady_clock::duration d) { return std::chrono::duration<double, std::milli>(d).count(); }
 
@@ -40,6 +42,8 @@ TickLoop::TickLoop(const World& world, Region* region, RegionLinks* links, Journ
       journal_(journal),
       options_(std::move(options)),
       hooks_(std::move(hooks)),
+      said_tick_(region->tick()),
+      said_bodies_(region->bodies()),
       windows_(world.environment.tick_us),
       replaying_(options_.recovered),
       checkpointed_(region->tick()),
@@ -139,7 +143,8 @@ void TickLoop::Checkpoint() {
   if (region_->tick() < checkpointed_ + options_.checkpoint_every || journal_->writing()) return;
   const Clock::time_point since = Clock::now();
   aureole::Checkpoint checkpoint = TakeCheckpoint(options_.world_hash, *region_, *links_);
-  checkpoint.hashes.assign(recent_hashes_.begin(), recent_hashes_.end());
+  const size_t kept = std::min(recent_hashes_.size(), kCheckpointHashes);
+  checkpoint.hashes.assign(recent_hashes_.end() - static_cast<std::ptrdiff_t>(kept), recent_hashes_.end());
   journal_->Write(std::move(checkpoint));
   checkpointed_ = region_->tick();
   longest_pause_ = std::max(longest_pause_, Clock::now() - since);
@@ -152,12 +157,34 @@ void TickLoop::EndReplay() {
   hooks_.log(absl::StrCat("caught up at tick ", region_->tick()));
 }
 
-void TickLoop::AddHash(const aureole::Checkpoint::Hash& h) {
+void TickLoop::AppendHash(const aureole::Checkpoint::Hash& h) {
   v1::TickHash* hash = pending_.add_hashes();
   hash->set_tick(h.tick);
   hash->set_hash(h.hash);
   hash->set_bodies(h.bodies);
-  if (journal_ == nullptr) return;
+}
+
+void TickLoop::AppendRecentHashes() {
+  pending_.clear_hashes();
+  for (const aureole::Checkpoint::Hash& h : recent_hashes_) AppendHash(h);
+}
+
+// Until the control plane is there again, which then asks for the hashes (SayAgain): the newest windows and violations.
+void TickLoop::KeepUnsaid() {
+  v1::Report kept;
+  kept.mutable_windows()->Swap(pending_.mutable_windows());
+  kept.mutable_violation_log()->Swap(pending_.mutable_violation_log());
+  pending_ = std::move(kept);
+  const auto trim = [](auto* field) {
+    const int extra = field->size() - kMostUnsaid;
+    if (extra > 0) field->DeleteSubrange(0, extra);
+  };
+  trim(pending_.mutable_windows());
+  trim(pending_.mutable_violation_log());
+}
+
+void TickLoop::AddHash(const aureole::Checkpoint::Hash& h) {
+  AppendHash(h);
   recent_hashes_.push_back(h);
   while (recent_hashes_.size() > kRecentHashes) recent_hashes_.pop_front();
 }
@@ -252,6 +279,7 @@ void TickLoop::AfterTick() {
 
 void TickLoop::Report(const std::vector<RegionId>& waiting_for, bool finished) {
   const Clock::time_point now = Clock::now();
+  if (say_again_.exchange(false)) AppendRecentHashes();
   v1::Report& r = pending_;
   const RegionStats& stats = region_->stats();
   const EngineCounts counts = region_->engine().Counts();
@@ -301,8 +329,18 @@ void TickLoop::Report(const std::vector<RegionId>& waiting_for, bool finished) {
     r.set_storage_failures(journal.failures);
     r.set_storage_failure(journal.last_failure);
   }
-  hooks_.report(r);
-  pending_.Clear();
+  said_tick_ = r.tick();
+  said_bodies_ = r.bodies();
+  const bool heard = hooks_.report(r);
+  if (finished && hooks_.epilogue) {
+    AppendRecentHashes();
+    hooks_.epilogue(r, heard);
+  }
+  if (heard) {
+    pending_.Clear();
+  } else {
+    KeepUnsaid();
+  }
   frames_since_report_.clear();
   reported_at_ = now;
   reported_tick_ = region_->tick();

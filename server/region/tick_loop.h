@@ -43,7 +43,10 @@ class TickLoop {
     std::function<void(const FrameSample&)> after_tick;
     // After each tick, with the clients' inputs that were delivered in it.
     std::function<void(Region*, int64_t bodies, const std::vector<Input>& delivered)> publish;
-    std::function<void(const v1::Report&)> report;
+    std::function<bool(const v1::Report&)> report;  // false: nobody has heard it
+    // May be null. After the last report, the same with all hashes that may not have been heard: what is said to a
+    // control plane that comes later.
+    std::function<void(const v1::Report&, bool heard)> epilogue;
     std::function<void(const std::string&)> log;  // waits over 1 s, violations, refused frames
   };
 
@@ -54,6 +57,11 @@ class TickLoop {
   bool Run();
   // From any thread, also before Run; Run returns soon after.
   void Stop();
+  // From any thread: the next report says the newest hashes again, which may not have been heard.
+  void SayAgain() { say_again_ = true; }
+  // From any thread: of the newest report.
+  Tick reported_tick() const { return said_tick_; }
+  int64_t reported_bodies() const { return said_bodies_; }
 
  private:
   using Clock = RegionLinks::Clock;
@@ -65,6 +73,9 @@ class TickLoop {
   void Checkpoint();
   void EndReplay();
   void AddHash(const aureole::Checkpoint::Hash& h);
+  void AppendHash(const aureole::Checkpoint::Hash& h);
+  void AppendRecentHashes();
+  void KeepUnsaid();
   bool AwaitPeers();
   void Take(Clock::time_point deadline);
   void EndLap();
@@ -77,7 +88,9 @@ class TickLoop {
   Journal* const journal_;
   const Options options_;
   const Hooks hooks_;
-  std::atomic<bool> stopped_ = false;
+  std::atomic<bool> stopped_ = false, say_again_ = false;
+  std::atomic<Tick> said_tick_;
+  std::atomic<int64_t> said_bodies_;
 
   FrameClock clock_;
   WindowMeter windows_;

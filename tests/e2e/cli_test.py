@@ -144,6 +144,44 @@ class Processes(Cli):
         self.assertEqual(json.loads(out)["hashes"], json.loads(whole[1])["hashes"])
         self.assert_gone(servers)
 
+    def test_killed_control_plane_leaves_its_servers_to_the_next(self):
+        with tempfile.TemporaryDirectory() as directory:
+            store = pathlib.Path(directory, "control.db")
+            command = [str(BIN / "aureole-control"), str(WORLDS / "demo.json"), "--store", str(store)]
+
+            def control():
+                process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+                self.addCleanup(process.kill)
+                lines = []
+
+                def read():
+                    lines.extend(iter(process.stderr.readline, ""))
+
+                threading.Thread(target=read, daemon=True).start()
+                wait_for(lambda: any("running, 4 regions" in line for line in lines), "running")
+                return process, lines
+
+            def servers():
+                files = pathlib.Path(directory, "data").glob("region-*.server")
+                return sorted(int(file.read_text().split()[2]) for file in files)
+
+            first, _ = control()
+            pids = servers()
+            self.assertEqual(len(pids), 4)
+            first.kill()
+            first.wait()
+            second, lines = control()
+            wait_for(lambda: sum("a control plane of epoch 2 is there" in line for line in lines) == 4, "four join again")
+            self.assertEqual(servers(), pids)
+            second.terminate()
+            self.assertEqual(second.wait(DEADLINE_S), 0)
+            wait_for(lambda: any("left; 4 servers go on" in line for line in lines), "told")
+            self.assertTrue(all(alive(pid) for pid in pids))
+            third, _ = control()
+            third.send_signal(signal.SIGINT)
+            self.assertEqual(third.wait(DEADLINE_S), 0)
+            self.assertFalse(any(alive(pid) for pid in pids))
+
     def test_killed_server_without_checkpoints_fails_the_run_by_name(self):
         process = self.start("up", WORLDS / "demo.json", "--checkpoint-every", "0", *self.fake())
         servers = self.servers_of(process, 4)

@@ -8,6 +8,7 @@
 #include <mutex>
 #include <thread>
 
+#include "server/transport/world_spec.h"
 #include "tests/e2e/fake_region.h"
 
 namespace aureole {
@@ -209,7 +210,7 @@ class ServiceTest : public Test {
 
   static RunPlan Plan() {
     RunPlan plan;
-    plan.tokens = {"a", "b"};
+    plan.regions = {{.token = "a"}, {.token = "b"}};
     return plan;
   }
   static v1::FromRegion Hello(const std::string& token) {
@@ -256,7 +257,86 @@ TEST_F(ServiceTest, ReportBeforeHelloOrStartIsRefused) {
   v1::FromRegion report;
   report.mutable_report()->set_tick(1);
   EXPECT_EQ(Say({report}).error_message(), "the first message must be a Hello");
-  EXPECT_EQ(Say({Hello("b"), report}).error_message(), "a Report before the Start, or after the last one");
+  EXPECT_EQ(Say({Hello("b"), report}).error_message(), "a Report before the Start");
+}
+
+TEST_F(ServiceTest, ServerThatJoinsAgainMustRunWhatItsTokenIsFor) {
+  v1::FromRegion again = Hello("a");
+  v1::Running* running = again.mutable_hello()->mutable_running();
+  running->set_region(1);
+  running->set_incarnation(1);
+  running->set_world_hash(WorldHash(Plan().world));
+  EXPECT_EQ(Say({again}).error_message(),
+            "hello.running: is incarnation 1 of region 1, its token is of incarnation 1 of region 0");
+  running->set_region(0);
+  running->set_incarnation(2);
+  EXPECT_EQ(Say({again}).error_code(), grpc::StatusCode::FAILED_PRECONDITION);
+  running->set_incarnation(1);
+  running->set_world_hash(17);
+  EXPECT_EQ(Say({again}).error_message(), "hello.running.world_hash: is of another world");
+  EXPECT_FALSE(service_.Status().regions[0].joined);
+}
+
+TEST_F(ServiceTest, ServerThatJoinsAgainIsReadyAndHearsWhereItsPeersAre) {
+  grpc::ClientContext first_context, second_context;
+  const auto first = stub_->Join(&first_context);
+  first->Write(Hello("a"));
+  v1::FromRegion again = Hello("b");
+  v1::Running* running = again.mutable_hello()->mutable_running();
+  running->set_region(1);
+  running->set_incarnation(1);
+  running->set_world_hash(WorldHash(Plan().world));
+  running->set_start_unix_us(1234);
+  running->set_tick(70);
+  while (!service_.Status().regions[0].joined) service_.Wait(std::chrono::milliseconds(100));
+  const auto second = stub_->Join(&second_context);
+  second->Write(again);
+  v1::ToRegion heard;
+  ASSERT_TRUE(second->Read(&heard));
+  EXPECT_EQ(heard.peer_moved().region(), 0);
+  EXPECT_EQ(heard.peer_moved().endpoint(), "127.0.0.1:1");
+  const RunStatus status = service_.Status();
+  EXPECT_TRUE(status.regions[1].ready);
+  EXPECT_EQ(status.regions[1].report.tick(), 70);
+  EXPECT_EQ(status.start_unix_us, 1234) << "the world runs";
+  service_.Close();
+  EXPECT_EQ(first->Finish().error_code(), grpc::StatusCode::UNAVAILABLE);
+  EXPECT_EQ(second->Finish().error_code(), grpc::StatusCode::UNAVAILABLE);
+}
+
+TEST(ControlHub, FindsTheWorldOfACallOrTellsItToComeAgain) {
+  ControlHub hub;
+  grpc::ServerBuilder builder;
+  int port = 0;
+  builder.AddListeningPort("127.0.0.1:0", grpc::InsecureServerCredentials(), &port);
+  builder.RegisterService(&hub);
+  const std::unique_ptr<grpc::Server> server = builder.BuildAndStart();
+  const auto stub = v1::Control::NewStub(
+      grpc::CreateChannel("127.0.0.1:" + std::to_string(port), grpc::InsecureChannelCredentials()));
+  const auto join = [&](const std::string& world) {
+    grpc::ClientContext context;
+    if (!world.empty()) context.AddMetadata(kWorldMetadata, world);
+    const auto stream = stub->Join(&context);
+    v1::FromRegion hello;
+    hello.mutable_hello()->set_protocol_version(kControlProtocolVersion);
+    hello.mutable_hello()->set_endpoint("127.0.0.1:1");
+    hello.mutable_hello()->set_token("not this");
+    stream->Write(hello);
+    v1::ToRegion answer;
+    while (stream->Read(&answer)) {
+    }
+    return stream->Finish();
+  };
+  ControlService one{RunPlan()}, two{RunPlan()};
+  hub.Add("one", &one);
+  hub.Add("two", &two);
+  EXPECT_EQ(join("one").error_code(), grpc::StatusCode::UNAUTHENTICATED) << "it reached the run";
+  EXPECT_EQ(join("two").error_code(), grpc::StatusCode::UNAUTHENTICATED);
+  EXPECT_EQ(join("three").error_message(), "aureole-world: no world 'three' runs here now; come again");
+  EXPECT_EQ(join("").error_code(), grpc::StatusCode::UNAVAILABLE);
+  hub.Remove("two");
+  EXPECT_EQ(join("two").error_code(), grpc::StatusCode::UNAVAILABLE);
+  server->Shutdown(std::chrono::system_clock::now());
 }
 
 TEST_F(ServiceTest, OldProtocolIsToldWhichOneIsSpoken) {

@@ -111,6 +111,7 @@ class Cluster {
           reconnects_ += report.reconnects();
           windows_ += report.windows_size();
         }
+        return true;
       };
       hooks.log = [](const std::string& what) { ADD_FAILURE() << what; };
       node->loop = std::make_unique<TickLoop>(world_, node->region.get(), node->links.get(), nullptr, options, hooks);

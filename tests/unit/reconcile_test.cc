@@ -60,6 +60,16 @@ TEST(Reconcile, ServerThatLeftHasAMomentToEndByItself) {
   EXPECT_EQ(Decide(r), "end 3: its stream ended");
 }
 
+TEST(Reconcile, ServerOfAnEarlierControlPlaneHasAMomentToJoinAgain) {
+  RegionObserved r = Running();
+  r.joined = r.connected = false;
+  r.adopted = true;
+  r.silent_s = kRejoinSeconds - 1;
+  EXPECT_EQ(Decide(r), "");
+  r.silent_s = kRejoinSeconds + 1;
+  EXPECT_EQ(Decide(r), "end 3: it has not joined again");
+}
+
 TEST(Reconcile, ServerThatLoadsHasNothingToSay) {
   RegionObserved r = Running();
   r.joined = r.connected = false;
