@@ -17,7 +17,7 @@
 namespace aureole {
 
 struct Event {
-  enum class Kind { kMessage, kControlLost, kSignal };
+  enum class Kind { kMessage, kControlLost, kSignal, kFenced };
   Kind kind = Kind::kMessage;
   v1::ToRegion message;
   std::string reason;    // why the stream ended

@@ -73,7 +73,7 @@ HostedRegion::HostedRegion(const v1::Assignment& assignment, World world)
 absl::Status HostedRegion::LoadRegion(const std::filesystem::path& data) {
   const bool keep = assignment_.checkpoint_every() > 0;
   if (keep) {
-    absl::StatusOr<std::unique_ptr<Journal>> journal = Journal::Open(data);
+    absl::StatusOr<std::unique_ptr<Journal>> journal = Journal::Open(data, assignment_.incarnation());
     if (!journal.ok()) return journal.status();
     journal_ = *std::move(journal);
   }

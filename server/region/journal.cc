@@ -11,8 +11,10 @@
 #include <system_error>
 
 #include <absl/strings/match.h>
+#include <absl/strings/numbers.h>
 #include <absl/strings/str_cat.h>
 #include <absl/strings/str_format.h>
+#include <absl/strings/str_split.h>
 
 #include "server/core/archive.h"
 #include "server/core/check.h"
@@ -22,9 +24,9 @@ namespace aureole {
 namespace {
 
 constexpr const char* kCheckpoint = "checkpoint";
-constexpr const char* kLogPrefix = "inputs-";
+constexpr const char* kLog = "inputs";  // segments are inputs-INCARNATION-NUMBER
 
-absl::Status Failed(const char* what, const std::filesystem::path& path) {
+absl::Status FileError(const char* what, const std::filesystem::path& path) {
   return absl::UnavailableError(absl::StrCat("cannot ", what, " ", path.string(), ": ", std::strerror(errno)));
 }
 
@@ -32,7 +34,7 @@ absl::Status WriteAll(int file, const std::string& bytes, const std::filesystem:
   for (size_t done = 0; done < bytes.size();) {
     const ssize_t n = write(file, bytes.data() + done, bytes.size() - done);
     if (n < 0 && errno == EINTR) continue;
-    if (n < 0) return Failed("write", path);
+    if (n < 0) return FileError("write", path);
     done += static_cast<size_t>(n);
   }
   return absl::OkStatus();
@@ -40,20 +42,20 @@ absl::Status WriteAll(int file, const std::string& bytes, const std::filesystem:
 
 absl::Status SyncDirectory(const std::filesystem::path& directory) {
   const int file = open(directory.c_str(), O_RDONLY | O_DIRECTORY | O_CLOEXEC);
-  if (file < 0) return Failed("open", directory);
+  if (file < 0) return FileError("open", directory);
   const bool synced = fsync(file) == 0;
   close(file);
-  return synced ? absl::OkStatus() : Failed("sync", directory);
+  return synced ? absl::OkStatus() : FileError("sync", directory);
 }
 
 absl::Status WriteAtomically(const std::filesystem::path& path, const std::string& bytes) {
   const std::filesystem::path next = path.string() + ".new";
   const int file = open(next.c_str(), O_WRONLY | O_CREAT | O_TRUNC | O_CLOEXEC, 0600);
-  if (file < 0) return Failed("write", next);
+  if (file < 0) return FileError("write", next);
   absl::Status s = WriteAll(file, bytes, next);
-  if (s.ok() && fsync(file) != 0) s = Failed("sync", next);
-  if (close(file) != 0 && s.ok()) s = Failed("close", next);
-  if (s.ok() && std::rename(next.c_str(), path.c_str()) != 0) s = Failed("rename", next);
+  if (s.ok() && fsync(file) != 0) s = FileError("sync", next);
+  if (close(file) != 0 && s.ok()) s = FileError("close", next);
+  if (s.ok() && std::rename(next.c_str(), path.c_str()) != 0) s = FileError("rename", next);
   return s.ok() ? SyncDirectory(path.parent_path()) : s;
 }
 
@@ -61,7 +63,7 @@ absl::StatusOr<std::string> ReadAll(const std::filesystem::path& path) {
   std::ifstream in(path, std::ios::binary);
   if (!in) return absl::NotFoundError(absl::StrCat("no ", path.string()));
   std::string bytes(std::istreambuf_iterator<char>(in), {});
-  if (in.bad()) return Failed("read", path);
+  if (in.bad()) return FileError("read", path);
   return bytes;
 }
 
@@ -99,12 +101,15 @@ absl::Status ReadRecords(std::string_view bytes, bool last, std::vector<LoggedIn
 
 }  // namespace
 
-absl::StatusOr<std::unique_ptr<Journal>> Journal::Open(std::filesystem::path directory) {
+Journal::Journal(std::filesystem::path root, uint64_t incarnation)
+    : root_(std::move(root)), directory_(root_ / absl::StrCat("i", incarnation)), incarnation_(incarnation) {}
+
+absl::StatusOr<std::unique_ptr<Journal>> Journal::Open(const std::filesystem::path& directory, uint64_t incarnation) {
   std::error_code error;
   std::filesystem::create_directories(directory, error);
   if (error) return absl::UnavailableError(absl::StrCat("cannot make ", directory.string(), ": ", error.message()));
   if (absl::Status s = WriteAtomically(directory / "writable", ""); !s.ok()) return s;
-  std::unique_ptr<Journal> out(new Journal(std::move(directory)));
+  std::unique_ptr<Journal> out(new Journal(directory, incarnation));
   Journal* const j = out.get();
   j->checkpoint_thread_ = std::thread([j] { j->WriteCheckpoints(); });
   j->log_thread_ = std::thread([j] { j->WriteLog(); });
@@ -122,18 +127,82 @@ Journal::~Journal() {
   if (log_file_ >= 0) close(log_file_);
 }
 
-// Ascending by the time of their making.
-std::vector<std::filesystem::path> Journal::SegmentFiles() const {
-  std::vector<std::filesystem::path> out;
+// The directories that are here, by incarnation.
+std::map<uint64_t, std::filesystem::path> Journal::Incarnations() const {
+  std::map<uint64_t, std::filesystem::path> out;
   std::error_code error;
-  for (const auto& entry : std::filesystem::directory_iterator(directory_, error)) {
-    if (absl::StartsWith(entry.path().filename().string(), kLogPrefix)) out.push_back(entry.path());
+  for (const auto& entry : std::filesystem::directory_iterator(root_, error)) {
+    const std::string name = entry.path().filename().string();
+    uint64_t incarnation = 0;
+    if (absl::StartsWith(name, "i") && absl::SimpleAtoi(name.substr(1), &incarnation)) {
+      out[incarnation] = entry.path();
+    }
   }
-  std::sort(out.begin(), out.end());
   return out;
 }
 
+// To be asked after something was written: only then it is known that the next incarnation has seen it.
+bool Journal::TakenOver() const {
+  std::error_code error;
+  if (std::filesystem::exists(directory_, error)) return false;
+  const std::map<uint64_t, std::filesystem::path> all = Incarnations();
+  return !all.empty() && all.rbegin()->first > incarnation_;
+}
+
+absl::Status Journal::TakeOver() {
+  const std::map<uint64_t, std::filesystem::path> all = Incarnations();
+  if (all.empty()) return absl::NotFoundError(absl::StrCat("no ", (root_ / "iN" / kCheckpoint).string()));
+  const auto& [newest, path] = *all.rbegin();
+  if (newest >= incarnation_) {
+    return absl::AbortedError(
+        absl::StrCat(path.string(), " is not of an earlier incarnation than this, ", incarnation_));
+  }
+  if (std::rename(path.c_str(), directory_.c_str()) != 0) return FileError("rename", path);
+  return SyncDirectory(root_);
+}
+
+// The segments of the latest incarnation that has any hold all that is needed. They are put together in one of this
+// incarnation, since a fenced one may still write to those it has open.
+absl::Status Journal::ReadLog(Recovered* out) const {
+  std::map<uint64_t, std::map<int64_t, std::filesystem::path>> found;
+  std::error_code error;
+  for (const auto& entry : std::filesystem::directory_iterator(directory_, error)) {
+    const std::string name = entry.path().filename().string();
+    const std::vector<std::string> words = absl::StrSplit(name, '-');
+    uint64_t incarnation = 0;
+    int64_t number = 0;
+    if (words.size() != 3 || words[0] != kLog || !absl::SimpleAtoi(words[1], &incarnation) ||
+        !absl::SimpleAtoi(words[2], &number)) {
+      continue;
+    }
+    found[incarnation][number] = entry.path();
+  }
+  if (found.empty()) return absl::OkStatus();
+  const auto& files = found.rbegin()->second;
+  for (const auto& [number, path] : files) {
+    const absl::StatusOr<std::string> records = ReadAll(path);
+    if (!records.ok()) return records.status();
+    if (absl::Status s = ReadRecords(*records, number == files.rbegin()->first, &out->inputs); !s.ok()) {
+      return absl::DataLossError(absl::StrCat(path.string(), ": ", std::string(s.message())));
+    }
+  }
+  std::erase_if(out->inputs, [out](const LoggedInput& l) { return l.tick <= out->checkpoint.tick; });
+  std::string all;
+  for (const LoggedInput& l : out->inputs) all += RecordOf(l.tick, l.input);
+  if (absl::Status s = WriteAtomically(SegmentFile(0), all); !s.ok()) return s;
+  for (const auto& [incarnation, old] : found) {
+    if (incarnation == incarnation_) continue;
+    for (const auto& [number, path] : old) std::filesystem::remove(path, error);
+  }
+  return absl::OkStatus();
+}
+
+std::filesystem::path Journal::SegmentFile(int64_t number) const {
+  return directory_ / absl::StrCat(kLog, "-", incarnation_, "-", number);
+}
+
 absl::StatusOr<Journal::Recovered> Journal::Recover(uint64_t world_hash, RegionId region) {
+  if (absl::Status s = TakeOver(); !s.ok()) return s;
   const absl::StatusOr<std::string> bytes = ReadAll(directory_ / kCheckpoint);
   if (!bytes.ok()) return bytes.status();
   absl::StatusOr<Checkpoint> checkpoint = DecodeCheckpoint(*bytes);
@@ -147,23 +216,25 @@ absl::StatusOr<Journal::Recovered> Journal::Recover(uint64_t world_hash, RegionI
         checkpoint->region, checkpoint->world_hash, region, world_hash));
   }
   Recovered out{*std::move(checkpoint), {}};
-  const std::vector<std::filesystem::path> files = SegmentFiles();
-  for (const std::filesystem::path& file : files) {
-    const absl::StatusOr<std::string> records = ReadAll(file);
-    if (!records.ok()) return records.status();
-    if (absl::Status s = ReadRecords(*records, file == files.back(), &out.inputs); !s.ok()) {
-      return absl::DataLossError(absl::StrCat(file.string(), ": ", std::string(s.message())));
-    }
-    const std::lock_guard lock(mutex_);
-    segments_.push_back({file, out.inputs.empty() ? 0 : out.inputs.back().tick});
-  }
-  std::erase_if(out.inputs, [&out](const LoggedInput& l) { return l.tick <= out.checkpoint.tick; });
+  if (absl::Status s = ReadLog(&out); !s.ok()) return s;
+  const std::lock_guard lock(mutex_);
+  if (!out.inputs.empty()) segments_.push_back({SegmentFile(0), out.inputs.back().tick});
+  next_segment_ = 1;
   return out;
 }
 
 absl::Status Journal::Begin(const Checkpoint& first) {
   std::error_code error;
-  for (const std::filesystem::path& file : SegmentFiles()) std::filesystem::remove(file, error);
+  for (const auto& [incarnation, path] : Incarnations()) {
+    if (incarnation > incarnation_) {
+      return absl::AbortedError(absl::StrCat(path.string(), " is of a later incarnation than this, ", incarnation_));
+    }
+    std::filesystem::remove_all(path, error);
+  }
+  if (!std::filesystem::create_directory(directory_, error)) {
+    return absl::UnavailableError(absl::StrCat("cannot make ", directory_.string(), ": ", error.message()));
+  }
+  if (absl::Status s = SyncDirectory(root_); !s.ok()) return s;
   size_t bytes = 0;
   return Store(first, &bytes);
 }
@@ -201,27 +272,25 @@ void Journal::WriteLog() {
     const uint64_t upto = logged_;
     const std::string records = std::exchange(records_, {});
     const bool begin = segments_.back().path.empty();
-    if (begin) {
-      const std::vector<std::filesystem::path> files = SegmentFiles();
-      const int64_t next = files.empty() ? 0 : std::atoll(files.back().filename().c_str() + strlen(kLogPrefix)) + 1;
-      segments_.back().path = directory_ / absl::StrFormat("%s%012d", kLogPrefix, next);
-    }
+    if (begin) segments_.back().path = SegmentFile(next_segment_++);
     const std::filesystem::path path = segments_.back().path;
     lock.unlock();
     absl::Status s;
     if (begin) {
       if (log_file_ >= 0) close(log_file_);
       log_file_ = open(path.c_str(), O_WRONLY | O_CREAT | O_EXCL | O_APPEND | O_CLOEXEC, 0600);
-      s = log_file_ < 0 ? Failed("write", path) : SyncDirectory(directory_);
+      s = log_file_ < 0 ? FileError("write", path) : SyncDirectory(directory_);
     }
     if (s.ok()) s = WriteAll(log_file_, records, path);
-    if (s.ok() && fdatasync(log_file_) != 0) s = Failed("sync", path);
+    if (s.ok() && fdatasync(log_file_) != 0) s = FileError("sync", path);
+    const bool taken_over = TakenOver();
+    if (taken_over) s = absl::AbortedError(absl::StrCat(root_.string(), " was taken over by a later incarnation"));
     lock.lock();
     logged_durable_ = upto;
+    fenced_ |= taken_over;
     if (!s.ok()) {
       log_status_ = s;
-      ++stats_.failures;
-      stats_.last_failure = std::string(s.message());
+      Failed(s);
       new_segment_ = true;  // what is torn stays at the end of its file
     }
     changed_.notify_all();
@@ -269,11 +338,22 @@ void Journal::WriteCheckpoints() {
       durable_ = std::move(used);
       DropSegments(checkpoint.tick);
     } else {
-      ++stats_.failures;
-      stats_.last_failure = std::string(s.message());
+      fenced_ |= TakenOver();
+      Failed(s);
     }
     changed_.notify_all();
   }
+}
+
+// Holds the mutex.
+void Journal::Failed(const absl::Status& s) {
+  ++stats_.failures;
+  stats_.last_failure = std::string(s.message());
+}
+
+bool Journal::fenced() const {
+  const std::lock_guard lock(mutex_);
+  return fenced_;
 }
 
 // Holds the mutex.

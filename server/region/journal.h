@@ -4,6 +4,10 @@
 // Two threads of its own write, so that a large checkpoint does not hold up the inputs. A file is either whole or not
 // there: checkpoints are renamed into place, records of inputs carry a check sum, and a torn record at the end was
 // never told to anybody.
+//
+// The incarnations of a region share a directory, in which each has one of its own, iN. The next one takes it over by
+// renaming it, which fences the one before, should that still run: what it writes afterwards it cannot make durable, so
+// that nobody hears of it, and it learns that it was fenced. The file system must be coherent between their machines.
 #pragma once
 
 #include <condition_variable>
@@ -50,22 +54,24 @@ class Journal {
   using Used = std::map<RegionId, uint64_t>;
 
   // Makes the directory when it is missing. Unavailable: it cannot be made, or nothing can be written there.
-  static absl::StatusOr<std::unique_ptr<Journal>> Open(std::filesystem::path directory);
+  static absl::StatusOr<std::unique_ptr<Journal>> Open(const std::filesystem::path& directory, uint64_t incarnation);
   // Ends what is being written.
   ~Journal();
   Journal(const Journal&) = delete;
   Journal& operator=(const Journal&) = delete;
 
-  // What is here. NotFound: no checkpoint. DataLoss: it, or the log, is damaged. FailedPrecondition: of another world
-  // or region.
+  // What the incarnation before has left, which is fenced. NotFound: no checkpoint. DataLoss: it, or the log, is
+  // damaged. FailedPrecondition: of another world or region. Aborted: a later incarnation is here, or was.
   absl::StatusOr<Recovered> Recover(uint64_t world_hash, RegionId region);
-  // Forgets what is here, and waits until the first checkpoint is durable.
+  // Forgets what is here of all incarnations, and waits until the first checkpoint is durable.
   absl::Status Begin(const Checkpoint& first);
 
   // The tick thread. Starts to make inputs durable that will be offered in tick n; ticks do not descend.
   void Log(Tick n, const std::vector<Input>& inputs);
   // Waits until all that was logged is durable. Not OK: it could not be written, and is forgotten.
   absl::Status AwaitLogged();
+  // A later incarnation has taken over: this one must not say anything any more.
+  bool fenced() const;
   // Whether a checkpoint is still being written.
   bool writing() const;
   // Precondition: none is being written.
@@ -81,15 +87,21 @@ class Journal {
     Tick last = 0;               // the last tick in it
   };
 
-  explicit Journal(std::filesystem::path directory) : directory_(std::move(directory)) {}
+  Journal(std::filesystem::path root, uint64_t incarnation);
+  std::map<uint64_t, std::filesystem::path> Incarnations() const;
+  bool TakenOver() const;
+  absl::Status TakeOver();
+  absl::Status ReadLog(Recovered* out) const;
   void WriteCheckpoints();
   void WriteLog();
   absl::Status Append(const std::string& bytes);
   absl::Status Store(const Checkpoint& checkpoint, size_t* bytes) const;
+  void Failed(const absl::Status& s);
   void DropSegments(Tick durable);
-  std::vector<std::filesystem::path> SegmentFiles() const;
+  std::filesystem::path SegmentFile(int64_t number) const;
 
-  const std::filesystem::path directory_;
+  const std::filesystem::path root_, directory_;
+  const uint64_t incarnation_;
 
   mutable std::mutex mutex_;
   std::condition_variable changed_;
@@ -102,6 +114,8 @@ class Journal {
   absl::Status log_status_;
   std::deque<Segment> segments_;  // the last one is being written
   bool new_segment_ = true;
+  int64_t next_segment_ = 0;
+  bool fenced_ = false;
   Stats stats_;
 
   int log_file_ = -1;  // of the log thread

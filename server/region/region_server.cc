@@ -193,6 +193,11 @@ TickLoop::Hooks Process::Hooks() {
     last_report = report;
     if (!heard) SayLastReport();  // a new stream may have come since
   };
+  hooks.fenced = [this] {
+    Event event;
+    event.kind = Event::Kind::kFenced;
+    events.Push(std::move(event));
+  };
   hooks.log = [](const std::string& what) { spdlog::warn("{}", what); };
   return hooks;
 }
@@ -273,6 +278,10 @@ bool HandleEvent(Process* process, const Event& event, int* exit_code, std::stri
       return false;
     case Event::Kind::kControlLost:
       return ControlLost(process, event, exit_code, reason);
+    case Event::Kind::kFenced:
+      *reason = "fenced: a later incarnation has taken over the checkpoints";
+      *exit_code = 1;
+      return false;
     case Event::Kind::kMessage:
       break;
   }

@@ -94,6 +94,11 @@ bool TickLoop::RunTick() {
   const Tick n = region_->tick() + 1;
   if (journal_ != nullptr) Checkpoint();
   OfferInputs();
+  // An input that this one has logged in vain the later one may have found, and will tell in this tick.
+  if (journal_ != nullptr && journal_->fenced()) {
+    hooks_.fenced();
+    return false;
+  }
   while (region_->tick() < n) {
     if (!AwaitPeers()) return false;
     out_.clear();

@@ -48,6 +48,7 @@ class TickLoop {
     // control plane that comes later.
     std::function<void(const v1::Report&, bool heard)> epilogue;
     std::function<void(const std::string&)> log;  // waits over 1 s, violations, refused frames
+    std::function<void()> fenced;                 // with a journal: a later incarnation has taken over; the loop ends
   };
 
   // All outlive the loop. `journal`: null for none.

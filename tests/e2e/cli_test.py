@@ -134,7 +134,7 @@ class Processes(Cli):
     def test_killed_server_is_replaced_and_the_run_goes_on(self):
         process = self.start("up", WORLDS / "demo.json", "--duration", "6s", "--data", self.path / "data", "--json")
         servers = self.servers_of(process, 4)
-        wait_for(lambda: (self.path / "data/region-2/checkpoint").exists(), "a checkpoint")
+        wait_for(lambda: (self.path / "data/region-2/i1/checkpoint").exists(), "a checkpoint")
         time.sleep(1.5)  # it ticks
         os.kill(servers[2], signal.SIGKILL)
         out, err = process.communicate(timeout=DEADLINE_S)

@@ -43,7 +43,7 @@ class JournalTest : public testing::Test {
   ~JournalTest() override { fs::remove_all(directory_); }
 
   std::unique_ptr<Journal> Open() {
-    absl::StatusOr<std::unique_ptr<Journal>> j = Journal::Open(directory_ / "region-2");
+    absl::StatusOr<std::unique_ptr<Journal>> j = Journal::Open(directory_ / "region-2", ++incarnation_);
     EXPECT_TRUE(j.ok()) << j.status();
     return j.ok() ? *std::move(j) : nullptr;
   }
@@ -62,14 +62,24 @@ class JournalTest : public testing::Test {
   }
   std::vector<fs::path> Logs() const {
     std::vector<fs::path> out;
-    for (const auto& e : fs::directory_iterator(directory_ / "region-2")) {
+    for (const auto& e : fs::recursive_directory_iterator(directory_ / "region-2")) {
       if (e.path().filename().string().starts_with("inputs-")) out.push_back(e.path());
     }
     std::sort(out.begin(), out.end());
     return out;
   }
 
+  fs::path Checkpoint() const { return directory_ / "region-2" / ("i" + std::to_string(incarnation_)) / "checkpoint"; }
+  // What is there now, to be had again.
+  void Keep() { fs::copy(directory_ / "region-2", directory_ / "kept", fs::copy_options::recursive); }
+  void Restore() {
+    fs::remove_all(directory_ / "region-2");
+    fs::copy(directory_ / "kept", directory_ / "region-2", fs::copy_options::recursive);
+    incarnation_ = 1;
+  }
+
   fs::path directory_;
+  uint64_t incarnation_ = 0;  // the newest
 };
 
 TEST_F(JournalTest, NextIncarnationFindsTheCheckpointAndTheInputsAfterIt) {
@@ -118,8 +128,10 @@ TEST_F(JournalTest, TornRecordAtTheEndIsNoInput) {
     j->Log(1, {Push(1), Push(2)});
     ASSERT_TRUE(j->AwaitLogged().ok());
   }
+  Keep();
   const uintmax_t size = fs::file_size(Logs().at(0));
   for (uintmax_t cut = 1; cut < size / 2; cut += 7) {
+    Restore();
     fs::resize_file(Logs().at(0), size - cut);
     EXPECT_EQ(SequencesOf(*Recover()), (std::vector<uint64_t>{1})) << cut;
   }
@@ -143,20 +155,21 @@ TEST_F(JournalTest, DamageIsFoundAndNamed) {
     file.seekp(at);
     file.put(static_cast<char>(old ^ 1));
   };
+  Keep();
   ASSERT_TRUE(Recover().ok());
+  Restore();
   flip(Logs().at(0), 20);
-  EXPECT_EQ(Recover().status().code(), absl::StatusCode::kDataLoss);
-  EXPECT_THAT(std::string(Recover().status().message()),
-              HasSubstr("inputs-000000000000: the log of inputs is damaged"));
-  flip(Logs().at(0), 20);
-  const fs::path checkpoint = directory_ / "region-2/checkpoint";
-  for (int at = 0; at < static_cast<int>(fs::file_size(checkpoint)); at += 3) {
-    flip(checkpoint, at);
+  const absl::Status s = Recover().status();
+  EXPECT_EQ(s.code(), absl::StatusCode::kDataLoss);
+  EXPECT_THAT(std::string(s.message()), HasSubstr("inputs-1-0: the log of inputs is damaged"));
+  for (int at = 0;; at += 3) {
+    Restore();
+    if (at >= static_cast<int>(fs::file_size(Checkpoint()))) break;
+    flip(Checkpoint(), at);
     EXPECT_EQ(Recover().status().code(), absl::StatusCode::kDataLoss) << at;
-    flip(checkpoint, at);
   }
   ASSERT_TRUE(Recover().ok());
-  fs::resize_file(checkpoint, 5);
+  fs::resize_file(Checkpoint(), 5);
   EXPECT_THAT(std::string(Recover().status().message()), HasSubstr("has only 5 bytes"));
 }
 
@@ -178,9 +191,48 @@ TEST_F(JournalTest, NewWorldForgetsWhatWasThere) {
   EXPECT_TRUE(Recover()->inputs.empty());
 }
 
+// It may still run where nobody can end it, on a machine that is cut off.
+TEST_F(JournalTest, IncarnationThatWasTakenOverMakesNothingDurable) {
+  const auto old = Open();
+  ASSERT_TRUE(old->Begin(CheckpointOf(0)).ok());
+  old->Log(1, {Push(1)});
+  ASSERT_TRUE(old->AwaitLogged().ok());
+  EXPECT_FALSE(old->fenced());
+  const auto next = Open();
+  EXPECT_EQ(SequencesOf(*next->Recover(kWorld, 2)), (std::vector<uint64_t>{1}));
+  old->Log(2, {Push(2)});
+  const absl::Status s = old->AwaitLogged();
+  EXPECT_EQ(s.code(), absl::StatusCode::kAborted) << s;
+  EXPECT_TRUE(old->fenced());
+  WriteAndWait(old.get(), CheckpointOf(9));
+  EXPECT_EQ(old->TakeDurable(), std::nullopt);
+  next->Log(2, {Push(3)});
+  ASSERT_TRUE(next->AwaitLogged().ok());
+  const auto third = Open();
+  const absl::StatusOr<Journal::Recovered> found = third->Recover(kWorld, 2);
+  EXPECT_EQ(found->checkpoint.tick, 0);
+  EXPECT_EQ(SequencesOf(*found), (std::vector<uint64_t>{1, 3})) << "nothing of what the first wrote too late";
+}
+
+TEST_F(JournalTest, IncarnationThatWasTakenOverSeesItAtACheckpoint) {
+  const auto old = Open();
+  ASSERT_TRUE(old->Begin(CheckpointOf(0)).ok());
+  ASSERT_TRUE(Recover().ok());
+  WriteAndWait(old.get(), CheckpointOf(9));
+  EXPECT_TRUE(old->fenced());
+  EXPECT_EQ(Recover()->checkpoint.tick, 0);
+}
+
+TEST_F(JournalTest, EarlierIncarnationThatComesLateIsRefused) {
+  const auto late = Open();
+  ASSERT_TRUE(Open()->Begin(CheckpointOf(0)).ok());
+  EXPECT_EQ(late->Recover(kWorld, 2).status().code(), absl::StatusCode::kAborted);
+  EXPECT_EQ(late->Begin(CheckpointOf(0)).code(), absl::StatusCode::kAborted);
+}
+
 TEST_F(JournalTest, WhereNothingCanBeWrittenIsSaid) {
   std::ofstream(directory_ / "file") << "x";
-  const absl::Status s = Journal::Open(directory_ / "file").status();
+  const absl::Status s = Journal::Open(directory_ / "file", 1).status();
   EXPECT_EQ(s.code(), absl::StatusCode::kUnavailable) << s;
   EXPECT_THAT(std::string(s.message()), HasSubstr((directory_ / "file").string()));
 }
@@ -203,7 +255,9 @@ TEST_F(JournalTest, FullDiskIsCountedAndTheLastCheckpointStays) {
   EXPECT_EQ(j->stats().failures, 2);
   EXPECT_THAT(j->stats().last_failure, HasSubstr("cannot write"));
   EXPECT_EQ(j->stats().durable_tick, 7);
-  EXPECT_EQ(Recover()->checkpoint.tick, 7);
+  Keep();
+  const auto copy = Journal::Open(directory_ / "kept", 2);
+  EXPECT_EQ((*copy)->Recover(kWorld, 2)->checkpoint.tick, 7);
 
   j->Log(9, {Push(2)});
   EXPECT_TRUE(j->AwaitLogged().ok());
