@@ -303,14 +303,20 @@ class Run {
   void OfferLive(Region& region) {
     Life& life = lives_[static_cast<size_t>(region.self())];
     const Tick n = region.tick();
+    furthest_ = std::max(furthest_, n);
     if (faults_.crashes && n <= life.offered) return;
     life.offered = n;
-    if (n <= life.offered_ever) {
-      for (auto [i, end] = life.log.equal_range(n); i != end; ++i) Submit(region, i->second);
-    } else {
-      OfferOfClients(region);
-      if (faults_.crashes) life.offered_ever = n;
-    }
+    for (auto [i, end] = life.log.equal_range(n); i != end; ++i) Submit(region, i->second);
+    if (MayTakeInputs(region)) OfferOfClients(region);
+  }
+
+  // What was told before it died must not be told differently. When all died, nobody knows how far they had come; their
+  // logs hold what clients know to be done, and newer inputs must not come before.
+  bool MayTakeInputs(const Region& region) const {
+    if (!lives_[static_cast<size_t>(region.self())].died) return true;
+    const auto logged = [&region](const Life& life) { return region.tick() <= life.log_until; };
+    return region.tick() >= known_ && network_.CaughtUp(region.self()) &&
+           std::none_of(lives_.begin(), lives_.end(), logged);
   }
 
   bool Submit(Region& region, const Input& input) {
@@ -320,12 +326,12 @@ class Run {
   }
 
   // Each client speaks to one region at a time. Now and then it goes to another, as after a lost connection, and says
-  // all again there.
+  // all again there of which it does not know what became.
   void OfferOfClients(Region& region) {
     for (size_t c = 0; c < clients_.size(); ++c) {
       Client& client = clients_[c];
       if (client.region != region.self()) continue;
-      for (; client.next < client.inputs.size() && client.inputs[client.next].tick <= region.tick(); ++client.next) {
+      for (; client.next < client.inputs.size() && client.inputs[client.next].tick <= furthest_; ++client.next) {
         if (!Submit(region, client.inputs[client.next])) return;
         lives_[static_cast<size_t>(region.self())].log.emplace(region.tick(), client.inputs[client.next]);
         if (client.next >= client.said) ++verdict_.live_inputs;
@@ -334,6 +340,10 @@ class Run {
       if (client.said == 0 || !rng_.Chance(0.02)) continue;
       client.region = AnyMember(region, rng_);
       client.next = 0;
+      const auto known = [&](size_t i) {
+        return acked_.contains({client.inputs[i].source, client.inputs[i].sequence});
+      };
+      while (client.next < client.said && known(client.next)) ++client.next;
     }
     for (auto [i, end] = control_.waiting.equal_range(region.self()); i != end; i = control_.waiting.erase(i)) {
       if (!Submit(region, i->second)) return;
@@ -341,7 +351,7 @@ class Run {
     }
   }
 
-  // Two at once at most.
+  // One or two at once; now and then, all.
   bool MayCrash() const { return verdict_.crashes < 8 && Dead() < 2; }
 
   int64_t Dead() const {
@@ -360,6 +370,29 @@ class Run {
     RegionId other = r;
     while (other == r) other = static_cast<RegionId>(crash_rng_.Below(static_cast<int>(regions_.size())));
     if (crash_rng_.Chance(0.3) && regions_[other] != nullptr && MayCrash()) Crash(other);
+    if (crash_rng_.Chance(0.1)) {
+      for (size_t i = 0; i < regions_.size(); ++i) {
+        if (regions_[i] != nullptr) Crash(static_cast<RegionId>(i));
+      }
+    }
+    Forget();
+  }
+
+  // All are dead. What some had done that others had not, and that no log tells, may come to be otherwise.
+  void Forget() {
+    if (Dead() <
+        static_cast<int64_t>(std::count_if(lives_.begin(), lives_.end(), [](const Life& l) { return l.exists; }))) {
+      return;
+    }
+    known_ = checked_;
+    for (const Life& life : lives_) known_ = std::max(known_, life.durable.tick);
+    const auto forget = [this](auto* by_tick) { by_tick->erase(by_tick->upper_bound(known_), by_tick->end()); };
+    forget(&before_step_);
+    forget(&after_step_);
+    for (Life& life : lives_) {
+      forget(&life.before_step);
+      forget(&life.after_step);
+    }
   }
 
   // A checkpoint is durable a while after it was taken. Until then a crash goes back to the one before.
@@ -390,6 +423,8 @@ class Run {
     }
     life.heard = life.durable.heard;
     life.offered = life.durable.tick - 1;
+    life.died = true;
+    life.log_until = life.log.empty() ? -1 : life.log.rbegin()->first;
     if (!life.after_step.empty()) verdict_.replayed_ticks += life.after_step.rbegin()->first - life.durable.tick;
     network_.Up(r, life.durable.senders, life.durable.taken);
   }
@@ -414,6 +449,7 @@ class Run {
         HearOfLayout(o);
       } else {
         outcomes_.push_back(o);
+        acked_.insert(o.name);
       }
     }
   }
@@ -637,7 +673,9 @@ class Run {
     std::optional<Saved> writing;  // durable from this tick on
     Tick durable_at = 0;
     std::multimap<Tick, Input> log;
-    Tick offered = -1, offered_ever = -1;              // of this life, and of any
+    bool died = false;
+    Tick log_until = -1;                               // of its log, when it died last
+    Tick offered = -1;                                 // of this life
     size_t heard = 0;                                  // of delivered_
     std::map<Tick, uint64_t> before_step, after_step;  // what it had, by tick
   };
@@ -664,6 +702,9 @@ class Run {
   std::vector<Input> delivered_;             // as the first region heard them
   std::map<InputName, InputOutcome> acted_;  // in the undivided world
   std::vector<InputOutcome> outcomes_;
+  std::set<InputName> acked_;  // that have one
+  Tick known_ = 0;             // to which all had come when all died, or from which one goes on
+  Tick furthest_ = 0;          // of any region, ever: the time of clients, who do not go back with those that die
   std::map<BodyId, int64_t> groups_;
   std::map<BodyId, bool> asleep_;
   std::map<BodyId, std::pair<int64_t, Epoch>> owned_;  // group and epoch when last seen

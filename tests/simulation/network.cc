@@ -102,6 +102,14 @@ void Network::Transmit(RegionId from, RegionId to, uint64_t sequence, const std:
   Push({at, 0, Event::Kind::kFrame, from, to, link.connection, sequence, frame});
 }
 
+bool Network::CaughtUp(RegionId region) const {
+  for (auto it = links_.lower_bound({region, 0}); it != links_.end() && it->first.first == region; ++it) {
+    const Link& link = it->second;
+    if (down_.contains(it->first.second) || link.receiver.applied() >= link.sender.next()) return false;
+  }
+  return true;
+}
+
 void Network::Wake(RegionId region, int64_t delay_us) {
   Push({now_us_ + delay_us, 0, Event::Kind::kWake, region, region, 0, 0, nullptr});
 }

@@ -40,6 +40,8 @@ class Network {
   // It is back: it goes on with what it kept then, and has taken so many frames of each peer. Of a
   // peer that is not named, because it was none then, it has taken what it had said to be durable.
   void Up(RegionId region, const Senders& senders, const std::map<RegionId, uint64_t>& taken);
+  // All that it speaks with are up, and none has had a frame of it that it has not sent again since it was down.
+  bool CaughtUp(RegionId region) const;
   // With crashes, frames are kept until the receiver says that they are durable there.
   void Durable(RegionId region, const std::map<RegionId, uint64_t>& taken);
 
