@@ -4,6 +4,7 @@
 #include <sys/prctl.h>
 #include <unistd.h>
 
+#include <cstdlib>
 #include <iostream>
 #include <string>
 
@@ -39,7 +40,8 @@ int main(int argc, char** argv) {
       ->check(CLI::IsMember({"debug", "info", "warn", "error", "off"}))
       ->capture_default_str();
   app.add_flag("--exit-with-parent", exit_with_parent, "end in order when the parent process dies");
-  app.add_option("--health-check", health_check, "only ask the server at host:port whether it is serving");
+  app.add_option("--health-check", health_check,
+                 "only ask the server at host:port whether it is serving; without a host: that of $POD_IP");
   try {
     app.parse(argc, argv);
     if (health_check.empty() && options.control.empty()) throw CLI::RequiredError("--control");
@@ -47,6 +49,8 @@ int main(int argc, char** argv) {
     return app.exit(e) == 0 ? 0 : 2;
   }
   if (!health_check.empty()) {
+    // Kubernetes puts no variables into a probe's command.
+    if (const char* pod = std::getenv("POD_IP"); health_check[0] == ':' && pod != nullptr) health_check.insert(0, pod);
     const auto security = aureole::Security::Open(options.security);
     const absl::Status s =
         security.ok() ? aureole::CheckHealth(health_check, (*security)->channel()) : security.status();

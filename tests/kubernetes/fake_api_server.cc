@@ -99,7 +99,7 @@ void FakeApiServer::Start() {
   } else {
     server_ = keys_->NewServer();
   }
-  server_->new_task_queue = [] { return new httplib::ThreadPool(12); };  // a connection holds a thread
+  server_->new_task_queue = [] { return new httplib::ThreadPool(32); };  // a connection holds a thread
   server_->set_keep_alive_timeout(1);
   const httplib::Server::Handler handler = [this](const httplib::Request& request, httplib::Response& response) {
     Handle(request, response);
@@ -170,6 +170,21 @@ Json FakeApiServer::Put(const std::string& path, Json object) {
   const auto found = objects_.find(KeyOf(place));
   if (found != objects_.end()) object["metadata"]["uid"] = found->second.second["metadata"]["uid"];
   return Store(place, std::move(object), found == objects_.end() ? "ADDED" : "MODIFIED");
+}
+
+Json FakeApiServer::Merge(const std::string& path, const Json& patch) {
+  const Place place = Parse(path).value();
+  const std::lock_guard lock(mutex_);
+  const auto found = objects_.find(KeyOf(place));
+  if (found == objects_.end()) return nullptr;
+  Json object = found->second.second;
+  object.merge_patch(patch);
+  return Store(place, std::move(object), "MODIFIED");
+}
+
+void FakeApiServer::PutLog(const std::string& pod, const std::string& text) {
+  const std::lock_guard lock(mutex_);
+  logs_[KeyOf(Parse(pod).value())] = text;
 }
 
 void FakeApiServer::Remove(const std::string& path) {
@@ -248,6 +263,11 @@ Json FakeApiServer::Store(const Place& place, Json object, const char* type) {
   if (!place.space.empty()) metadata["namespace"] = place.space;
   if (!metadata.contains("uid")) metadata["uid"] = absl::StrCat("uid-", next_uid_++);
   metadata["resourceVersion"] = Written(++version_);
+  const auto before = objects_.find(KeyOf(place));
+  const bool there = before != objects_.end();
+  const bool same = there && before->second.second.value("spec", Json()) == object.value("spec", Json());
+  metadata["generation"] =
+      (there ? IntegerAt(before->second.second, {"metadata", "generation"}).value_or(0) : 0) + (same ? 0 : 1);
   Place of = place;
   of.subresource.clear();
   history_.push_back({version_, of, type, object});
@@ -325,6 +345,7 @@ void FakeApiServer::Answer(const httplib::Request& request, const Place& place, 
   if (apply && !request.has_param("fieldManager")) return Refuse(response, 400, "BadRequest", "fieldManager");
 
   const Json now = there ? found->second.second : Json::object();
+  if (method == "GET" && place.subresource == "log") return response.set_content(logs_[KeyOf(at)], "text/plain");
   if (method == "GET") return response.set_content(now.dump(), "application/json");
   const std::string uid = TextAt(now, {"metadata", "uid"}), version = TextAt(now, {"metadata", "resourceVersion"});
   const auto conflicts = [](const std::string& wanted, const std::string& is) {
@@ -334,6 +355,14 @@ void FakeApiServer::Answer(const httplib::Request& request, const Place& place, 
     if (conflicts(TextAt(body, {"preconditions", "uid"}), uid) ||
         conflicts(TextAt(body, {"preconditions", "resourceVersion"}), version)) {
       return Refuse(response, 409, "Conflict", "the precondition does not hold");
+    }
+    const int64_t grace = IntegerAt(body, {"gracePeriodSeconds"}).value_or(30);
+    if (grace > 0 && !TextAt(now, {"spec", "nodeName"}).empty()) {  // a kubelet has to end it first
+      Json leaving = now;
+      leaving["metadata"]["deletionTimestamp"] = "2026-01-01T00:00:00Z";
+      leaving["metadata"]["deletionGracePeriodSeconds"] = grace;
+      const Json stored = Store(at, std::move(leaving), "MODIFIED");
+      return response.set_content(stored.dump(), "application/json");
     }
     Store(at, now, "DELETED");
     response.set_content(StatusObject(200, "", "").dump(), "application/json");

@@ -1,6 +1,6 @@
 // An API server for tests: objects of any kind in memory, with what a client has to get right: opaque versions,
-// optimistic concurrency, lists in pages, watches with a history that can be forgotten, bookmarks; and faults on
-// demand.
+// optimistic concurrency, lists in pages, watches with a history that can be forgotten, bookmarks, pods that are told
+// to leave before they go; and faults on demand.
 #pragma once
 
 #include <httplib.h>
@@ -70,8 +70,10 @@ class FakeApiServer {
   void SendBookmarks();        // to all watches
 
   // As another client would. `path` is that of the object: "/api/v1/namespaces/a/pods/p".
-  Json Put(const std::string& path, Json object);  // creates, or replaces whatever the version
-  void Remove(const std::string& path);
+  Json Put(const std::string& path, Json object);          // creates, or replaces whatever the version
+  Json Merge(const std::string& path, const Json& patch);  // into what is there, the status too; null when nothing is
+  void Remove(const std::string& path);                    // at once
+  void PutLog(const std::string& pod, const std::string& text);
   std::optional<Json> At(const std::string& path) const;
   std::vector<Json> All(const std::string& collection) const;  // "/api/v1/namespaces/a/pods"
 
@@ -116,6 +118,7 @@ class FakeApiServer {
   std::deque<Entry> history_;
   int64_t version_ = 1, forgotten_ = 0;
   int64_t next_uid_ = 1;
+  std::map<std::string, std::string> logs_;         // by the pod's key
   std::map<std::string, std::vector<Json>> pages_;  // rest of a list, by its continue token
   std::string token_;
   std::deque<Fault> faults_;

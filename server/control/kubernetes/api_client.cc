@@ -71,6 +71,20 @@ absl::StatusOr<Json> ApiClient::Get(const Resource& resource, const std::string&
   return Call({.method = "GET", .path = *path, .repeatable = true}, options);
 }
 
+absl::StatusOr<std::string> ApiClient::Log(const std::string& space, const std::string& pod, int lines,
+                                           const CallOptions& options) {
+  const absl::StatusOr<std::string> path = Resource{"", "v1", "pods", space, "log"}.ObjectPath(pod);
+  if (!path.ok()) return path.status();
+  HttpRequest request{.method = "GET",
+                      .url = absl::StrCat(access_.server, *path, Query({{"tailLines", absl::StrCat(lines)}})),
+                      .headers = {"Accept: */*"},
+                      .timeout = std::min(options.timeout, options.attempt_timeout)};
+  HttpReply reply;
+  if (absl::Status s = Exchange(&request, options.stop, &reply, nullptr); !s.ok()) return s;
+  if (absl::Status s = StatusOfExchange("GET " + *path, reply); !s.ok()) return s;
+  return std::move(reply.body);
+}
+
 absl::StatusOr<ObjectList> ApiClient::List(const Resource& resource, const Selection& selection,
                                            const CallOptions& options) {
   ObjectList out;

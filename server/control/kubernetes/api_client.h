@@ -99,6 +99,9 @@ class ApiClient {
   // Codes: api_status.h. Besides: InvalidArgument when the request names no object (nothing is sent), and the errors of
   // HttpConnection::Perform.
   absl::StatusOr<Json> Get(const Resource& resource, const std::string& name, const CallOptions& options = {});
+  // The last lines that a pod's only container has written; one try.
+  absl::StatusOr<std::string> Log(const std::string& space, const std::string& pod, int lines,
+                                  const CallOptions& options = {});
   // All pages. When the server forgets the snapshot in between (410), it begins again without pages.
   absl::StatusOr<ObjectList> List(const Resource& resource, const Selection& selection = {},
                                   const CallOptions& options = {});
