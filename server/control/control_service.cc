@@ -121,6 +121,10 @@ RunStatus ControlService::Status() const {
   out.stage = stage_;
   out.start_unix_us = start_unix_us_;
   for (const RegionRecord& record : regions_) out.regions.push_back(record.status);
+  const auto whole = std::find_if(hashes_.rbegin(), hashes_.rend(), [this](const auto& entry) {
+    return entry.second.regions == static_cast<int>(regions_.size());
+  });
+  if (whole != hashes_.rend()) out.hash = whole->second;
   return out;
 }
 

@@ -5,15 +5,18 @@
 #include <iostream>
 #include <memory>
 #include <optional>
+#include <string>
 
 #include <absl/strings/str_format.h>
 #include <absl/time/time.h>
 
 #include "server/control/interrupts.h"
+#include "server/control/kubernetes/control_process.h"
 #include "server/control/local_allocator.h"
 #include "server/control/run.h"
 #include "server/control/sqlite_store.h"
 #include "server/control/world_file.h"
+#include "server/transport/health_check.h"
 
 namespace {
 
@@ -22,16 +25,20 @@ constexpr int kOk = 0, kFailed = 1, kBadInput = 2;
 }  // namespace
 
 int main(int argc, char** argv) {
+  if (argc > 1 && argv[1] == std::string("kubernetes")) return aureole::kubernetes::KubernetesMain(argc - 1, argv + 1);
   aureole::CatchInterrupts();
-  CLI::App app{"Runs one world on region servers that it starts on this machine."};
+  CLI::App app{
+      "Runs one world on region servers that it starts on this machine. `aureole-control kubernetes` runs all Worlds "
+      "of "
+      "a namespace."};
   app.footer(
       "Example:\n  aureole-control tests/worlds/demo.json --listen 127.0.0.1:7000\n\n"
       "Exit codes: 0 it ran, 1 the run failed, 2 bad input (then nothing was started).");
-  std::string world_path, duration, store_path;
+  std::string world_path, duration, store_path, health_check;
   double checkpoint_s = 1;
   aureole::RunOptions options;
   aureole::LocalAllocator::Options servers;
-  app.add_option("world", world_path, "World file (JSON)")->required();
+  app.add_option("world", world_path, "World file (JSON)");
   app.add_option("--listen", options.listen, "Where region servers join, host:port; port 0 is any")
       ->capture_default_str();
   app.add_option("--duration", duration, "Simulated time, such as 60s or 2m; until interrupted when not given");
@@ -53,10 +60,19 @@ int main(int argc, char** argv) {
   app.add_option("--tokens", options.security.tokens, "File of the tokens that clients need; none when not given");
   app.add_flag("--insecure", options.security.insecure,
                "Allow plain text, and clients without tokens, beyond this machine");
+  app.add_option("--health-check", health_check, "Only ask the control plane at host:port whether it is serving");
   try {
     app.parse(argc, argv);
+    if (world_path.empty() && health_check.empty()) throw CLI::RequiredError("world");
   } catch (const CLI::ParseError& e) {
     return app.exit(e) == 0 ? kOk : kBadInput;
+  }
+  if (!health_check.empty()) {
+    const auto security = aureole::Security::Open(options.security);
+    const absl::Status s =
+        security.ok() ? aureole::CheckHealth(health_check, (*security)->channel()) : security.status();
+    std::cerr << (s.ok() ? "serving" : std::string(s.message())) << '\n';
+    return s.ok() ? kOk : kFailed;
   }
   const absl::StatusOr<aureole::WorldFile> file = aureole::OpenWorldFile(world_path);
   if (!file.ok()) {

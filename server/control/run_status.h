@@ -54,6 +54,7 @@ struct RunStatus {
   Stage stage = Stage::kJoining;
   int64_t start_unix_us = 0;  // wall time of tick 0; 0: not known yet
   std::vector<RegionStatus> regions;
+  TickSum hash;  // the newest that every region has told its part of; of no regions when there is none
 
   Tick MinTick() const;
   Tick MaxTick() const;

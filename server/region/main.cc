@@ -13,8 +13,8 @@
 #include <spdlog/spdlog.h>
 #include <CLI/CLI.hpp>
 
-#include "server/region/health_check.h"
 #include "server/region/region_server.h"
+#include "server/transport/health_check.h"
 
 int main(int argc, char** argv) {
   CLI::App app("One region server of an Aureole world. It joins the control plane, which tells it what to simulate.");

@@ -14,7 +14,7 @@
 #include "server/control/local_allocator.h"
 #include "server/control/run.h"
 #include "server/control/world_file.h"
-#include "server/region/health_check.h"
+#include "server/transport/health_check.h"
 
 namespace aureole {
 namespace {

@@ -50,6 +50,7 @@ class PodAllocator final : public Allocator {
   // The newest server of each region that has not ended. Unavailable: the API server has not answered in time.
   absl::StatusOr<std::vector<ServerStart>> Adopt() override;
   void Release() override;
+  bool released() const { return released_; }
 
   // Never fails: a Pod that is refused is a server that has ended, "its Pod cannot be made: ...".
   absl::Status Start(const ServerStart& start) override;

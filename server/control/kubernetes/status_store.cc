@@ -106,6 +106,11 @@ absl::Status StatusStore::SaveText(Json record) {
   return record_ ? absl::CancelledError("the record is not written: the control plane ends") : absl::OkStatus();
 }
 
+Json StatusStore::there() const {
+  const std::lock_guard lock(mutex_);
+  return there_;
+}
+
 void StatusStore::Publish(const WorldStatus& status) {
   {
     const std::lock_guard lock(mutex_);

@@ -45,6 +45,8 @@ class StatusStore final : public WorldStore {
   // A world that is begun anew has none. As Save.
   absl::Status Forget();
 
+  // As last read or written.
+  Json there() const;
   // Any thread, returns at once: is written when it can be. Fields that are not named stay as they were.
   void Publish(const WorldStatus& status);
   // Waits until all is written; false when that takes longer.

@@ -5,6 +5,7 @@
 #include <limits>
 
 #include <absl/strings/str_cat.h>
+#include <absl/strings/str_format.h>
 #include <absl/strings/str_join.h>
 #include <absl/time/time.h>
 
@@ -123,6 +124,10 @@ WorldStatus StatusOf(const WorldResource& world, const RunStatus& run, const std
                 {"awake", run.Awake()},
                 {"realTimeFactor", std::isfinite(slowest) ? Rounded(slowest) : 0},
                 {"regions", regions}};
+  if (run.hash.regions > 0) {
+    out.fields["hash"] = {
+        {"tick", run.hash.tick}, {"hash", absl::StrFormat("%016x", run.hash.hash)}, {"bodies", run.hash.bodies}};
+  }
   if (run.start_unix_us != 0) {
     out.fields["startTime"] =
         absl::FormatTime("%Y-%m-%dT%H:%M:%SZ", absl::FromUnixMicros(run.start_unix_us), absl::UTCTimeZone());

@@ -1,4 +1,4 @@
-#include "server/region/health_check.h"
+#include "server/transport/health_check.h"
 
 #include <chrono>
 #include <memory>
