@@ -1,0 +1,283 @@
+// Worlds in a fake cluster with real control planes and region servers. Whatever happens to Pods, nodes, leaders and
+// the API server, the world ends bit for bit as one that nothing happened to.
+#include <gtest/gtest.h>
+
+#include <signal.h>
+
+#include <filesystem>
+#include <fstream>
+#include <iterator>
+
+#include <absl/strings/match.h>
+#include <absl/strings/str_cat.h>
+#include <absl/strings/str_format.h>
+
+#include "server/control/kubernetes/api_client.h"
+#include "server/control/local_allocator.h"
+#include "server/control/run.h"
+#include "server/control/world_file.h"
+#include "tests/kubernetes/fake_cluster.h"
+
+namespace aureole::kubernetes {
+namespace {
+
+using std::chrono::milliseconds;
+using std::chrono::seconds;
+using Clock = std::chrono::steady_clock;
+
+constexpr char kWorlds[] = "/apis/aureole.dev/v1alpha1/namespaces/test/worlds/";
+constexpr char kPods[] = "/api/v1/namespaces/test/pods/";
+constexpr char kFile[] = AUREOLE_WORLDS "/border-pile.json";
+constexpr int kSeconds = 8;  // of simulated time
+
+bool Await(const std::function<bool()>& condition, seconds at_most = seconds(60)) {
+  const auto end = Clock::now() + at_most;
+  while (!condition()) {
+    if (Clock::now() > end) return false;
+    std::this_thread::sleep_for(milliseconds(20));
+  }
+  return true;
+}
+
+std::string FileText() {
+  std::ifstream in(kFile);
+  return std::string(std::istreambuf_iterator<char>(in), {});
+}
+
+// The hash of the last state of an undisturbed run.
+std::string HashOfTheEnd() {
+  const absl::StatusOr<WorldFile> file = OpenWorldFile(kFile);
+  EXPECT_TRUE(file.ok()) << file.status();
+  RunOptions options;
+  options.world = file->spec;
+  options.regions = file->world.layout.size();
+  options.no_real_time = true;
+  options.last_tick = TicksIn(kSeconds, file->world.environment.tick_us);
+  options.hash_every = 100;
+  LocalAllocator allocator({.executable = AUREOLE_REGION, .log_directory = {}});
+  RunResult result;
+  const absl::Status s = RunWorld(
+      options, allocator, [](const RunStatus&) { return true; }, &result);
+  EXPECT_TRUE(s.ok()) << s;
+  return absl::StrFormat("%016x", result.hashes.back().hash);
+}
+
+class WorldLife : public testing::Test {
+ protected:
+  ~WorldLife() override {
+    if (HasFailure()) std::cerr << cluster_.World("w").dump(1) << "\n" << cluster_.Logs();
+  }
+  Json Spec() const {
+    return {{"world", Json::parse(FileText())},
+            {"storage", {{"hostPath", cluster_.disk()}}},
+            {"duration", absl::StrCat(kSeconds, "s")},
+            {"checkpointSeconds", 0.5},
+            {"hashEvery", 100}};
+  }
+  void Create(const Json& spec) { cluster_.api().Put(absl::StrCat(kWorlds, "w"), {{"kind", "World"}, {"spec", spec}}); }
+  Json Status() { return cluster_.World("w").value("status", Json::object()); }
+  std::string Phase() { return TextAt(Status(), {"phase"}); }
+  int64_t Tick() { return IntegerAt(Status(), {"tick"}).value_or(0); }
+  bool AwaitTick(int64_t tick) {
+    return Await([&] { return Phase() == "Running" && Tick() >= tick; });
+  }
+  uint64_t Incarnation(int region) {
+    const Json status = Status();
+    const Json* const regions = Find(status, {"regions"});
+    return regions == nullptr ? 0 : (*regions)[static_cast<size_t>(region)]["incarnation"].get<uint64_t>();
+  }
+  std::string Condition(const std::string& type, const char* field) {
+    for (const Json& condition : Status().value("conditions", Json::array())) {
+      if (TextAt(condition, {"type"}) == type) return TextAt(condition, {field});
+    }
+    return "";
+  }
+  bool HasEvent(const std::string& reason) {
+    for (const Json& event : cluster_.api().All("/api/v1/namespaces/test/events")) {
+      if (TextAt(event, {"reason"}) == reason) return true;
+    }
+    return false;
+  }
+  void ExpectEndAsUndisturbed() {
+    ASSERT_TRUE(Await([&] { return Phase() == "Finished"; })) << Phase() << " at tick " << Tick();
+    EXPECT_EQ(TextAt(Status(), {"hash", "hash"}), HashOfTheEnd());
+    EXPECT_EQ(Condition("Exact", "status"), "True");
+    EXPECT_TRUE(Await([&] { return cluster_.processes() == 0; }));
+  }
+
+  FakeCluster cluster_;
+};
+
+TEST_F(WorldLife, RunsToItsEndAndSaysSo) {
+  cluster_.StartControl(0);
+  Create(Spec());
+  ASSERT_TRUE(AwaitTick(50));
+  EXPECT_EQ(TextAt(Status(), {"regionsReady"}), "2/2");
+  EXPECT_EQ(Condition("Ready", "status"), "True");
+  EXPECT_EQ(Condition("Applied", "status"), "True");
+  EXPECT_GT(IntegerAt(Status(), {"bodies"}), 200);
+  EXPECT_EQ(TextAt(Status()["regions"][1], {"pod"}), "w-r1-i1");
+  EXPECT_FALSE(TextAt(Status()["regions"][1], {"node"}).empty());
+  ExpectEndAsUndisturbed();
+  EXPECT_TRUE(Await([&] { return cluster_.Pods("w").empty(); }));
+  EXPECT_TRUE(Await([&] { return HasEvent("Running") && HasEvent("Finished"); }));
+}
+
+TEST_F(WorldLife, DeletedPodIsReplaced) {
+  cluster_.StartControl(0);
+  Create(Spec());
+  ASSERT_TRUE(AwaitTick(100));
+  ApiClient people(cluster_.api().Access());
+  ASSERT_TRUE(people.Delete({"", "v1", "pods", "test"}, "w-r1-i1").ok());
+  ASSERT_TRUE(Await([&] { return Incarnation(1) == 2; }));
+  EXPECT_EQ(Incarnation(0), 1u);
+  ExpectEndAsUndisturbed();
+  EXPECT_TRUE(Await([&] { return HasEvent("RegionReplaced"); }));
+}
+
+TEST_F(WorldLife, KilledServerIsReplaced) {
+  cluster_.StartControl(0);
+  Create(Spec());
+  ASSERT_TRUE(AwaitTick(100));
+  ASSERT_EQ(kill(cluster_.ProcessOf("w-r0-i1"), SIGKILL), 0);
+  ASSERT_TRUE(Await([&] { return Incarnation(0) == 2; }));
+  ExpectEndAsUndisturbed();
+}
+
+// The worst case: the node's processes go on, and nobody can end them.
+TEST_F(WorldLife, LostNodeIsFencedAndItsRegionsRunElsewhere) {
+  cluster_.StartControl(0);
+  Create(Spec());
+  ASSERT_TRUE(AwaitTick(100));
+  const std::string node = TextAt(Status()["regions"][0], {"node"});
+  const pid_t old = cluster_.ProcessOf("w-r0-i1");
+  cluster_.LoseNode(node, /*processes_go_on=*/true);
+  ApiClient controllers(cluster_.api().Access());  // as the node controller does after a while
+  ASSERT_TRUE(controllers.Delete({"", "v1", "pods", "test"}, "w-r0-i1").ok());
+  kill(old, SIGSTOP);  // nothing is heard of it
+  ASSERT_TRUE(Await([&] { return Incarnation(0) >= 2; }));
+  kill(old, SIGCONT);
+  ASSERT_TRUE(Await([&] { return TextAt(Status()["regions"][0], {"node"}) != node; }));
+  ASSERT_TRUE(Await([&] { return Phase() == "Finished"; })) << Phase() << " at tick " << Tick();
+  EXPECT_EQ(TextAt(Status(), {"hash", "hash"}), HashOfTheEnd());
+}
+
+TEST_F(WorldLife, NextLeaderTakesOverWhatRuns) {
+  cluster_.StartControl(0);
+  ASSERT_TRUE(Await([&] { return cluster_.Leader() == 0; }));
+  cluster_.StartControl(1);
+  Create(Spec());
+  ASSERT_TRUE(AwaitTick(100));
+  const pid_t servers[] = {cluster_.ProcessOf("w-r0-i1"), cluster_.ProcessOf("w-r1-i1")};
+  cluster_.SignalControl(0, SIGKILL);
+  ASSERT_TRUE(Await([&] { return cluster_.Leader() == 1; }));
+  ASSERT_TRUE(Await([&] { return IntegerAt(Status(), {"controlEpoch"}).value_or(0) == 2; }));
+  const int64_t tick = Tick();
+  ASSERT_TRUE(Await([&] { return Tick() > tick && TextAt(Status(), {"regionsReady"}) == "2/2"; }));
+  EXPECT_EQ(kill(servers[0], 0), 0);
+  EXPECT_EQ(kill(servers[1], 0), 0);
+  EXPECT_EQ(Incarnation(0), 1u);
+  EXPECT_EQ(Incarnation(1), 1u);
+  ExpectEndAsUndisturbed();
+}
+
+TEST_F(WorldLife, LeaderThatIsToldToEndHandsOverAtOnce) {
+  cluster_.StartControl(0);
+  ASSERT_TRUE(Await([&] { return cluster_.Leader() == 0; }));
+  cluster_.StartControl(1);
+  Create(Spec());
+  ASSERT_TRUE(AwaitTick(50));
+  cluster_.SignalControl(0, SIGTERM);
+  const auto told = Clock::now();
+  ASSERT_TRUE(Await([&] { return cluster_.Leader() == 1; }));
+  EXPECT_LT(Clock::now() - told, seconds(3)) << "the lease had to run out";
+  EXPECT_TRUE(Await([&] { return !cluster_.ControlRuns(0); }));
+  ExpectEndAsUndisturbed();
+  EXPECT_EQ(Incarnation(0), 1u);
+  EXPECT_EQ(Incarnation(1), 1u);
+}
+
+TEST_F(WorldLife, ServerThatDiesWithTheLeaderIsReplacedByTheNext) {
+  cluster_.StartControl(0);
+  Create(Spec());
+  ASSERT_TRUE(AwaitTick(100));
+  cluster_.SignalControl(0, SIGKILL);
+  kill(cluster_.ProcessOf("w-r1-i1"), SIGKILL);
+  cluster_.StartControl(1);
+  ASSERT_TRUE(Await([&] { return Incarnation(1) == 2; }));
+  ExpectEndAsUndisturbed();
+  EXPECT_EQ(Incarnation(0), 1u);
+}
+
+TEST_F(WorldLife, GoesOnWhileTheApiServerIsAway) {
+  cluster_.StartControl(0);
+  Create(Spec());
+  ASSERT_TRUE(AwaitTick(100));
+  cluster_.api().Stop();
+  // Longer than the lease: the leader ends, the servers do not.
+  ASSERT_TRUE(Await([&] { return !cluster_.ControlRuns(0); }));
+  cluster_.api().Start();
+  cluster_.StartControl(1);
+  ExpectEndAsUndisturbed();
+  EXPECT_EQ(Incarnation(0), 1u);
+}
+
+TEST_F(WorldLife, DeletedWorldStopsInOrder) {
+  cluster_.StartControl(0);
+  Create(Spec());
+  ASSERT_TRUE(AwaitTick(50));
+  cluster_.api().Remove(absl::StrCat(kWorlds, "w"));
+  EXPECT_TRUE(Await([&] { return cluster_.processes() == 0 && cluster_.Pods("w").empty(); }));
+  // A new one of the same name has nothing of the old one.
+  Create(Spec());
+  ASSERT_TRUE(AwaitTick(50));
+}
+
+TEST_F(WorldLife, RefusedWorldSaysWhyAndRunsOnceItIsRight) {
+  cluster_.StartControl(0);
+  Json spec = Spec();
+  spec["world"]["bodys"] = Json::array();
+  Create(spec);
+  ASSERT_TRUE(Await([&] { return Phase() == "Pending"; }));
+  EXPECT_EQ(Condition("Ready", "reason"), "Refused");
+  EXPECT_TRUE(absl::StartsWith(Condition("Ready", "message"), "spec.world.bodys: there is no such field"));
+  EXPECT_TRUE(cluster_.Pods("w").empty());
+  EXPECT_TRUE(Await([&] { return HasEvent("Refused"); }));
+  cluster_.api().Merge(absl::StrCat(kWorlds, "w"), {{"spec", {{"world", {{"bodys", nullptr}}}}}});
+  ASSERT_TRUE(AwaitTick(10));
+}
+
+TEST_F(WorldLife, ChangeThatCannotBeIsSaidAndTheRunGoesOn) {
+  cluster_.StartControl(0);
+  Create(Spec());
+  ASSERT_TRUE(AwaitTick(50));
+  cluster_.api().Merge(absl::StrCat(kWorlds, "w"), {{"spec", {{"duration", "1000s"}, {"image", "newer"}}}});
+  ASSERT_TRUE(Await([&] { return Condition("Applied", "status") == "False"; }));
+  EXPECT_TRUE(absl::StartsWith(Condition("Applied", "message"), "spec.duration: cannot change"));
+  kill(cluster_.ProcessOf("w-r0-i1"), SIGKILL);
+  ASSERT_TRUE(Await([&] { return Incarnation(0) == 2; }));
+  const auto next = cluster_.api().At(absl::StrCat(kPods, "w-r0-i2"));
+  ASSERT_TRUE(next);
+  EXPECT_EQ((*next)["spec"]["containers"][0]["image"], "newer");
+  // The next control plane knows what has begun, too.
+  cluster_.SignalControl(0, SIGKILL);
+  cluster_.StartControl(1);
+  ExpectEndAsUndisturbed();
+}
+
+TEST_F(WorldLife, WorldsOfOneControlPlaneDoNotMix) {
+  cluster_.StartControl(0);
+  Json spec = Spec();
+  cluster_.api().Put("/api/v1/namespaces/test/configmaps/files", {{"data", {{"pile.json", FileText()}}}});
+  spec.erase("world");
+  spec["worldFrom"] = {{"configMap", "files"}, {"key", "pile.json"}};
+  Create(spec);
+  spec["realTime"] = false;
+  cluster_.api().Put(absl::StrCat(kWorlds, "v"), {{"kind", "World"}, {"spec", spec}});
+  ExpectEndAsUndisturbed();
+  ASSERT_TRUE(Await([&] { return TextAt(cluster_.World("v"), {"status", "phase"}) == "Finished"; }));
+  EXPECT_EQ(TextAt(cluster_.World("v"), {"status", "hash", "hash"}), TextAt(Status(), {"hash", "hash"}));
+}
+
+}  // namespace
+}  // namespace aureole::kubernetes
