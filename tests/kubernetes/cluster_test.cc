@@ -10,7 +10,9 @@
 #include "server/control/kubernetes/cluster_access.h"
 #include "server/control/kubernetes/event_recorder.h"
 #include "server/control/kubernetes/leader_elector.h"
+#include "server/control/kubernetes/pod_allocator.h"
 #include "server/control/kubernetes/reflector.h"
+#include "server/control/kubernetes/status_store.h"
 #include "tests/kubernetes/await.h"
 
 namespace aureole::kubernetes {
@@ -28,8 +30,9 @@ class Cluster : public testing::Test {
     const auto access = FindAccess("");
     ASSERT_TRUE(access.ok()) << access.status();
     client_ = new ApiClient(*access);
-    space_ = absl::StrCat("aureole-test-", getpid());
-    group_ = absl::StrCat("t", getpid(), ".aureole.example");
+    static int suites = 0;  // a namespace goes only slowly
+    space_ = absl::StrCat("aureole-test-", getpid(), "-", ++suites);
+    group_ = absl::StrCat("t", getpid(), "-", suites, ".aureole.example");
     worlds_ = {group_, "v1", "worlds", space_};
     config_maps_ = {"", "v1", "configmaps", space_};
     ASSERT_TRUE(client_->Create(kNamespaces, {{"metadata", {{"name", space_}}}}).ok());
@@ -203,6 +206,137 @@ TEST_F(Cluster, RepeatedEventsAreCounted) {
   ASSERT_TRUE(events.ok()) << events.status();
   ASSERT_EQ(events->items.size(), 1u);
   EXPECT_EQ(IntegerAt(events->items[0], {"count"}), 50);
+}
+
+// World objects, of a definition that takes all: that of k8s/ when it is there already.
+class WorldCluster : public Cluster {
+ protected:
+  static void SetUpTestSuite() {
+    Cluster::SetUpTestSuite();
+    const Json any = {{"type", "object"}, {"x-kubernetes-preserve-unknown-fields", true}};
+    const Json version = {{"name", kWorldVersion},
+                          {"served", true},
+                          {"storage", true},
+                          {"subresources", {{"status", Json::object()}}},
+                          {"schema", {{"openAPIV3Schema", any}}}};
+    const absl::Status made = client_
+                                  ->Create(kDefinitions, {{"metadata", {{"name", "worlds.aureole.dev"}}},
+                                                          {"spec",
+                                                           {{"group", kWorldGroup},
+                                                            {"scope", "Namespaced"},
+                                                            {"names", {{"plural", "worlds"}, {"kind", kWorldKind}}},
+                                                            {"versions", Json::array({version})}}}})
+                                  .status();
+    made_ = made.ok();
+    ASSERT_TRUE(made.ok() || absl::IsAlreadyExists(made)) << made;
+    ASSERT_TRUE(Await([] { return client_->List(WorldsOf(space_)).ok(); }));
+    // No Pod is taken before.
+    ASSERT_TRUE(Await([] { return client_->Get({"", "v1", "serviceaccounts", space_}, "default").ok(); }));
+    const Json spec = {{"world", {{"name", "w"}}}, {"storage", {{"emptyDir", Json::object()}}}};
+    const absl::StatusOr<Json> world = client_->Create(WorldsOf(space_), {{"apiVersion", WorldsOf(space_).ApiVersion()},
+                                                                          {"kind", kWorldKind},
+                                                                          {"metadata", {{"name", "w"}}},
+                                                                          {"spec", spec}});
+    ASSERT_TRUE(world.ok()) << world.status();
+    uid_ = TextAt(*world, {"metadata", "uid"});
+  }
+  static void TearDownTestSuite() {
+    if (made_) {
+      EXPECT_TRUE(client_->Delete(kDefinitions, "worlds.aureole.dev").ok());
+    }
+    Cluster::TearDownTestSuite();
+  }
+
+  static inline bool made_ = false;
+  static inline std::string uid_;
+};
+
+// Without nodes, or with: the image is nowhere, so no Pod ever runs.
+TEST_F(WorldCluster, PodsAreTakenAsTheyAreMeantAndGoAgain) {
+  PodAllocator::Options options;
+  options.pods.world = "w";
+  options.pods.space = space_;
+  options.pods.uid = uid_;
+  options.pods.image = "localhost/aureole:none";
+  options.pods.pull_policy = "Never";
+  options.pods.resources = {{"requests", {{"cpu", "10m"}}}};
+  options.pods.node_selector = {{"aureole.dev/none", "none"}};
+  options.pods.tolerations = Json::array({{{"key", "a"}, {"operator", "Exists"}}});
+  options.pods.storage = {.kind = Storage::Kind::kVolumeClaim, .size = "1Mi"};
+  options.pods.neighbours = {{1}, {0}};
+  const Resource pods{"", "v1", "pods", space_};
+  {
+    PodAllocator allocator(client_, options);
+    const ServerStart start{0, 1, "token", "10.0.0.1:7100"};
+    const Json wanted = PodManifest(options.pods, start);
+    ASSERT_TRUE(allocator.Start(start).ok());
+    ASSERT_TRUE(Await([&] { return client_->Get(pods, "w-r0-i1").ok(); })) << allocator.Newest()[0].waits;
+    const Json there = client_->Get(pods, "w-r0-i1").value();
+    // The server drops fields that it does not know, and adds what was not given.
+    for (const char* field : {"affinity", "securityContext", "restartPolicy", "nodeSelector"}) {
+      EXPECT_EQ(there["spec"][field], wanted["spec"][field]) << field;
+    }
+    const Json &is = there["spec"]["containers"][0], &as = wanted["spec"]["containers"][0];
+    for (const char* field : {"args", "command", "resources", "securityContext", "imagePullPolicy", "volumeMounts"}) {
+      EXPECT_EQ(is[field], as[field]) << field;
+    }
+    for (const char* probe : {"readinessProbe", "livenessProbe"}) {
+      Json whole = is[probe];
+      whole.merge_patch(as[probe]);
+      EXPECT_EQ(is[probe], whole) << probe;
+    }
+    EXPECT_TRUE(client_->Get({"", "v1", "persistentvolumeclaims", space_}, "w-region-0").ok());
+    EXPECT_TRUE(absl::IsAlreadyExists(client_->Create(pods, wanted).status()));
+    EXPECT_TRUE(allocator.Poll().empty());
+    allocator.Release();
+  }
+  PodAllocator next(client_, options);
+  const auto adopted = next.Adopt();
+  ASSERT_TRUE(adopted.ok()) << adopted.status();
+  ASSERT_EQ(adopted->size(), 1u);
+  EXPECT_EQ((*adopted)[0].token, "token");
+  ASSERT_TRUE(client_->Delete(pods, "w-r0-i1").ok());
+  std::vector<ServerExit> exits;
+  ASSERT_TRUE(Await([&] {
+    exits = next.Poll();
+    return !exits.empty();
+  }));
+  EXPECT_EQ(exits[0].how, "deleted");
+  ASSERT_TRUE(next.Start({1, 1, "other", "10.0.0.1:7100"}).ok());
+  ASSERT_TRUE(Await([&] { return client_->Get(pods, "w-r1-i1").ok(); }));
+  next.Kill();
+  EXPECT_TRUE(client_->List(pods)->items.empty());
+}
+
+TEST_F(WorldCluster, StatusAndRecordSurviveOtherWriters) {
+  StatusStore::Options options;
+  options.space = space_;
+  options.name = "w";
+  options.uid = uid_;
+  options.interval = milliseconds(10);
+  StatusStore store(client_, options);
+  ASSERT_TRUE(store.Load().ok()) << store.Load().status();
+  v1::WorldRecord record;
+  record.set_world_hash(0xfedcba9876543210);
+  record.add_regions()->set_incarnation(3);
+  ASSERT_TRUE(store.Save(record).ok());
+  ASSERT_TRUE(client_->Patch(WorldsOf(space_), "w", {.body = {{"metadata", {{"labels", {{"a", "b"}}}}}}}).ok());
+  WorldStatus status;
+  status.fields = {{"phase", "Running"}, {"tick", 7}, {"realTimeFactor", 0.99}};
+  status.conditions = {{"Ready", true, "Running", ""}};
+  status.generation = 1;
+  store.Publish(status);
+  ASSERT_TRUE(store.Flush(seconds(20)));
+  record.mutable_regions(0)->set_incarnation(4);
+  ASSERT_TRUE(store.Save(record).ok());
+  const Json there = client_->Get(WorldsOf(space_), "w").value()["status"];
+  EXPECT_EQ(there["tick"], 7);
+  EXPECT_EQ(there["conditions"][0]["type"], "Ready");
+  EXPECT_EQ(there["observedGeneration"], 1);
+  StatusStore next(client_, options);
+  const auto found = next.Load();
+  ASSERT_TRUE(found.ok()) << found.status();
+  EXPECT_EQ((*found)->SerializeAsString(), record.SerializeAsString());
 }
 
 }  // namespace
