@@ -313,7 +313,7 @@ class ClusterTest(unittest.TestCase):
 class WorldTest(ClusterTest):
     """One running World per test."""
 
-    file, spec = "demo.json", {}
+    file, spec, regions = "demo.json", {}, 4
 
     @classmethod
     def setUpClass(cls):
@@ -321,10 +321,10 @@ class WorldTest(ClusterTest):
 
     def setUp(self):
         name = re.sub("[^a-z0-9]+", "-", self.id().rpartition(".")[2].removeprefix("test_"))[:32].strip("-")
-        self.world = World(name, self.file, **{"replicas": 4, **self.spec}).start()
+        self.world = World(name, self.file, **{"replicas": self.regions, **self.spec}).start()
         self.addCleanup(self.world.end)
         self.addCleanup(self._say_why)
-        self.world.runs()
+        self.world.runs(self.regions)
         self.began = time.monotonic()
 
     def _say_why(self):
