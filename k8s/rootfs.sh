@@ -11,7 +11,7 @@ top=$(dirname "$(dirname "$(realpath "${BASH_SOURCE[0]}")")")
 root=$1 bin=${2:-$top/build/release/bin}
 mkdir -p "$root"/{bin,etc}
 # The process is not root, and its root file system is read-only: volumes are mounted over these two.
-mkdir -p -m 1777 "$root/data" "$root/tmp"
+install -d -m 1777 "$root/data" "$root/tmp"
 
 for program in "${programs[@]}"; do
   [[ -x $bin/$program ]] || { echo "rootfs: $bin/$program is not there (./dev build ${programs[*]})" >&2 && exit 1; }
