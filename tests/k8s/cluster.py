@@ -283,9 +283,8 @@ class World:
     def hash_after(self, tick, seconds=DEADLINE_S):
         wait_for(lambda: any(t > tick for t in self.hashes), f"a state hash after tick {tick}", seconds)
 
-    def whole(self):
-        """The hashes of the same world on one server, as `hashes` has them."""
-        last = max(self.hashes)
+    def whole(self, last):
+        """The hashes of the same world on one server up to the tick `last`, as `hashes` has them."""
         out = json.loads(aureole("up", self.file, "--undivided", "--no-real-time", "--json", "--hash-every", HASH_EVERY,
                                  "--duration", f"{last * TICK_S:.3f}s", timeout=300))
         return {h["tick"]: (h["hash"], h["bodies"]) for h in out["hashes"]}
@@ -337,10 +336,14 @@ class WorldTest(ClusterTest):
     def assert_exact(self, after=0):
         """Every state hash that was said is that of the undivided world, bodies included; one comes after `after`."""
         self.world.hash_after(max(after, self.world.ticks.now()))
-        whole = self.world.whole()
-        differ = {t: (h, whole.get(t)) for t, h in self.world.hashes.items() if h != whole.get(t)}
+        self.assert_exact_so_far()
+
+    def assert_exact_so_far(self):
+        hashes = dict(self.world.hashes)
+        whole = self.world.whole(max(hashes))
+        differ = {t: (h, whole.get(t)) for t, h in hashes.items() if h != whole.get(t)}
         self.assertEqual(differ, {}, "tick: (what it was, what it is on one server)")
-        self.measure("hashes equal to the undivided world's", len(self.world.hashes), unit="")
+        self.measure("hashes equal to the undivided world's", len(hashes), unit="")
 
     def assert_others_stayed(self, before, regions):
         """No region but these has another incarnation than before."""
