@@ -92,8 +92,9 @@ absl::Status HostedRegion::LoadRegion(const std::filesystem::path& data) {
     region_ = std::make_unique<Region>(world_, assignment_.region(), MakeBulletEngine(world_.environment));
   }
   const auto log = [](RegionId peer, const std::string& what) { spdlog::info("link to region {}: {}", peer, what); };
-  links_ =
-      std::make_unique<RegionLinks>(IdentityOf(assignment_, world_), region_->peers(), log, keep, std::move(states));
+  LinkIdentity identity = IdentityOf(assignment_, world_);
+  if (!replay_.empty()) identity.log_until = replay_.back().tick;
+  links_ = std::make_unique<RegionLinks>(identity, region_->peers(), log, keep, std::move(states));
   for (RegionId peer : region_->peers()) {
     if (peer < assignment_.incarnations_size()) links_->Redirect(peer, "", assignment_.incarnations(peer));
   }

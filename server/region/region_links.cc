@@ -55,6 +55,12 @@ std::map<RegionId, LinkState> RegionLinks::States() const {
   return out;
 }
 
+Tick RegionLinks::log_until() const {
+  Tick out = identity_.log_until;
+  for (const auto& link : links_) out = std::max(out, link->log_until());
+  return out;
+}
+
 bool RegionLinks::caught_up() const {
   return std::all_of(links_.begin(), links_.end(), [](const auto& link) { return link->caught_up(); });
 }

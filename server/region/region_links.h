@@ -41,6 +41,8 @@ class RegionLinks {
   std::map<RegionId, LinkState> States() const;
   // Of all links.
   bool caught_up() const;
+  // Of this region and its peers, as far as they are met.
+  Tick log_until() const;
 
   // Queues the frames; never waits for the network.
   void Send(const std::vector<Frame>& frames);

@@ -46,8 +46,7 @@ TickLoop::TickLoop(const World& world, Region* region, RegionLinks* links, Journ
       said_bodies_(region->bodies()),
       windows_(world.environment.tick_us),
       replaying_(options_.recovered),
-      checkpointed_(region->tick()),
-      recovered_at_(region->tick()) {
+      checkpointed_(region->tick()) {
   for (const aureole::Checkpoint::Hash& h : options_.hashes) AddHash(h);
 }
 
@@ -124,9 +123,8 @@ void TickLoop::OfferInputs() {
     logged_.clear();
   }
   // When all servers died, none knows how far the world had come, and a client's newer inputs must not overtake those
-  // that another region's log still holds for later ticks. Checkpoints are never further behind than this.
-  const bool behind = options_.recovered && n <= recovered_at_ + 2 * options_.checkpoint_every;
-  if (replaying_ || behind || region_->inputs_waiting() > 0) return;
+  // that another region's log still holds for later ticks.
+  if (replaying_ || n <= log_until_ || region_->inputs_waiting() > 0) return;
   std::vector<Input> inputs = hooks_.inputs();
   if (journal_ == nullptr) {
     for (const Input& input : inputs) Submit(input);
@@ -158,6 +156,7 @@ void TickLoop::Checkpoint() {
 // What was lost is made up; the wall clock goes on from here, whatever it showed before.
 void TickLoop::EndReplay() {
   replaying_ = false;
+  log_until_ = links_->log_until();
   start_ = Clock::now() - microseconds((region_->tick() + 1) * world_.environment.tick_us);
   hooks_.log(absl::StrCat("caught up at tick ", region_->tick()));
 }

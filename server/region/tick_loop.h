@@ -105,7 +105,7 @@ class TickLoop {
   size_t replayed_ = 0;        // of options_.replay
   std::vector<Input> logged_;  // being made durable, for the next tick
   Tick checkpointed_ = 0;
-  const Tick recovered_at_;
+  Tick log_until_ = 0;                                   // of all regions that were loaded with this one
   std::deque<aureole::Checkpoint::Hash> recent_hashes_;  // that may not have reached the control plane
   Clock::duration longest_pause_{}, lost_{};
   Clock::time_point reported_at_;

@@ -8,7 +8,7 @@
 namespace aureole {
 
 // Of the link protocol. Grows with every change that an older server would not understand.
-inline constexpr uint32_t kPeerProtocolVersion = 6;
+inline constexpr uint32_t kPeerProtocolVersion = 7;
 
 // Bytes of one message on the wire; more is refused by gRPC before it is read.
 inline constexpr size_t kMaxMessageBytes = size_t{1} << 20;

@@ -162,6 +162,11 @@ bool PeerLink::caught_up() const {
   return peer_met_ && peer_applied_ < sender_.next();
 }
 
+Tick PeerLink::log_until() const {
+  const std::lock_guard lock(mutex_);
+  return peer_log_until_;
+}
+
 void PeerLink::Cut() {
   const std::lock_guard lock(mutex_);
   if (current_ != nullptr) current_->Cancel();
@@ -202,6 +207,7 @@ v1::LinkHello PeerLink::Hello() const {
   hello.set_applied(receiver_.applied());
   hello.set_keep(options_.keep);
   hello.set_durable(durable_);
+  hello.set_log_until(options_.identity.log_until);
   return hello;
 }
 
@@ -232,6 +238,7 @@ absl::Status PeerLink::Accept(LinkStream* stream, const v1::LinkHello& hello) {
   peer_incarnation_ = hello.incarnation();
   peer_met_ = true;
   peer_keeps_ = hello.keep();
+  peer_log_until_ = std::max(peer_log_until_, hello.log_until());
   peer_applied_ = hello.applied();
   sender_.Acknowledge(peer_keeps_ ? hello.durable() : hello.applied());
   sender_.Resume(hello.applied(),

@@ -40,6 +40,7 @@ struct LinkIdentity {
   uint64_t incarnation = 1;  // from 1
   int exchange_delay = 0;    // k
   int64_t tick_us = 0;
+  Tick log_until = 0;  // of the inputs that it has to repeat; 0: none
 };
 
 // FailedPrecondition says what differs and what to do, when `hello` is not from the same world, layout, protocol
@@ -130,6 +131,8 @@ class PeerLink {
   LinkState State() const;
   // The peer was met, and has had no frame of an earlier incarnation of this region that this one has not sent again.
   bool caught_up() const;
+  // The last tick of the peer's log of inputs, as its hellos said.
+  Tick log_until() const;
   // Ends the present connection, if any, as a fault of the network would; the link resumes. Any thread.
   void Cut();
   // Waits until every frame was written to a connection; false when that took longer.
@@ -181,8 +184,9 @@ class PeerLink {
   LinkReceiver receiver_;
   uint64_t told_ = 0;  // what the peer knows that we applied
   uint64_t durable_ = 0, told_durable_ = 0;
-  bool peer_met_ = false;          // this incarnation of it
-  bool peer_keeps_ = false;        // as its hello says
+  bool peer_met_ = false;    // this incarnation of it
+  bool peer_keeps_ = false;  // as its hello says
+  Tick peer_log_until_ = 0;
   uint64_t peer_applied_ = 0;      // by its last hello
   uint64_t peer_incarnation_ = 0;  // 0: not met yet
   LinkStream* current_ = nullptr;

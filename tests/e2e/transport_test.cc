@@ -24,8 +24,8 @@ LinkIdentity Identity(RegionId self) { return {kPeerProtocolVersion, 0xABCDEF, 3
 class End {
  public:
   // `incarnation` > 0: one that makes checkpoints, and was loaded from one.
-  End(RegionId self, RegionId peer, uint64_t incarnation = 0, LinkState state = {})
-      : identity_(Identity(self)), link_(Options(peer, incarnation, std::move(state))) {
+  End(RegionId self, RegionId peer, uint64_t incarnation = 0, LinkState state = {}, Tick log_until = 0)
+      : identity_(Identity(self)), link_(Options(peer, incarnation, std::move(state), log_until)) {
     grpc::ServerBuilder builder;
     ConfigureServer(&builder);
     builder.AddListeningPort("127.0.0.1:0", grpc::InsecureServerCredentials(), &port_);
@@ -61,8 +61,9 @@ class End {
   }
 
  private:
-  PeerLink::Options Options(RegionId peer, uint64_t incarnation, LinkState state) {
+  PeerLink::Options Options(RegionId peer, uint64_t incarnation, LinkState state, Tick log_until) {
     identity_.incarnation = std::max<uint64_t>(1, incarnation);
+    identity_.log_until = log_until;
     const auto log = [this](RegionId, const std::string& s) {
       const std::lock_guard lock(mutex_);
       log_ += s + "\n";
@@ -265,7 +266,7 @@ TEST(Handshake, WhatDiffersIsNamed) {
     EXPECT_NE(verdict.error_message().find(what), std::string::npos) << verdict.error_message();
     EXPECT_EQ(high.service().refused(), ++refusals);
   };
-  refused("protocol version is 6 here and 9 in region 0", [](v1::LinkHello* h) { h->set_protocol_version(9); });
+  refused("protocol version is 7 here and 9 in region 0", [](v1::LinkHello* h) { h->set_protocol_version(9); });
   refused("world hash is 0000000000abcdef here and 0000000000000005", [](v1::LinkHello* h) { h->set_world_hash(5); });
   refused("layout epoch is 3 here and 4", [](v1::LinkHello* h) { h->set_layout_epoch(4); });
   refused("exchange delay is 0 here and 2", [](v1::LinkHello* h) { h->set_exchange_delay(2); });
@@ -325,9 +326,10 @@ TEST(PeerLink, RegionThatDiedGoesOnFromItsCheckpoint) {
   while (high.link().stats().frames_kept > 7) std::this_thread::yield();  // those after the second
 
   low.reset();
-  low = std::make_unique<End>(0, 1, 2, checkpoint);
+  low = std::make_unique<End>(0, 1, 2, checkpoint, 77);
   low->link().Dial(high.endpoint());
   ASSERT_TRUE(low->Await(6));  // 4 to 9 again
+  EXPECT_EQ(high.link().log_until(), 77);
   EXPECT_EQ(low->frames().front().tick, 4);
   EXPECT_FALSE(low->link().caught_up());
   send(low.get(), 6, 8);  // what the other side has had
