@@ -45,6 +45,7 @@ ControlChannel::ControlChannel(const std::string& address, const std::shared_ptr
     : world_(std::move(world)) {
   grpc::ChannelArguments arguments;
   arguments.SetInt(GRPC_ARG_ENABLE_HTTP_PROXY, 0);
+  arguments.SetInt(GRPC_ARG_USE_LOCAL_SUBCHANNEL_POOL, 1);  // a connection of its own
   arguments.SetSslTargetNameOverride(kServerName);
   arguments.SetMaxReceiveMessageSize(limits::kMaxWorldFileBytes);  // an assignment holds the whole world
   // Who lost its control plane wants the next one soon.

@@ -40,7 +40,7 @@ class EventQueue {
   std::deque<Event> events_;
 };
 
-// Connections to one control plane address, over which streams are opened one after another.
+// A connection to a control plane, shared with no other channel, over which streams are opened one after another.
 class ControlChannel {
  public:
   // `world`: which of the control plane's worlds the server is for; empty: its only one.

@@ -113,8 +113,9 @@ struct Process {
   RecordingService recording;
   std::string data;
   std::unique_ptr<GrpcServer> server;
+  std::string control_address, world;
   v1::Hello hello;
-  std::unique_ptr<ControlChannel> channel;
+  std::unique_ptr<ControlChannel> channel;  // of the stream
   std::mutex control_mutex;  // guards what follows, but not its use by the main thread, which alone changes it
   std::unique_ptr<ControlStream> control;
   std::optional<v1::Report> last_report;  // of a run that is over
@@ -146,6 +147,8 @@ void Process::Join() {
     running->set_bodies(progress.bodies);
     hosted->SayAgain();
   }
+  // The address may be that of whichever control plane leads: a connection that leads to another one stays with it.
+  channel = std::make_unique<ControlChannel>(control_address, security->channel(), world);
   auto stream = std::make_unique<ControlStream>(channel.get(), hello, &events);
   const std::lock_guard lock(control_mutex);
   control = std::move(stream);
@@ -350,7 +353,8 @@ int RunRegionServer(const RegionServerOptions& options) {
   hello.set_pid(getpid());
   spdlog::info("aureole-region: pid {}, control {}, peers and clients {}, metrics {}", getpid(), options.control,
                process.server->endpoint(), process.metrics != nullptr ? process.metrics->endpoint() : "off");
-  process.channel = std::make_unique<ControlChannel>(options.control, process.security->channel(), options.world);
+  process.control_address = options.control;
+  process.world = options.world;
   process.give_up_joining = std::chrono::steady_clock::now() + kLongestJoin;
   process.Join();
 

@@ -269,7 +269,8 @@ class World:
                  f"{self.condition('Ready').get('message')})", seconds, 0.05)
 
     def events(self):
-        found = get("events", "--field-selector", f"involvedObject.kind=World,involvedObject.name={self.name}")
+        uid = self._last["metadata"]["uid"]  # there may have been others of this name
+        found = get("events", "--field-selector", f"involvedObject.uid={uid}")
         return [(e["reason"], e["message"]) for e in found["items"]]
 
     def logs(self):

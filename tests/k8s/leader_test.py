@@ -4,7 +4,7 @@ import os
 import signal
 import time
 
-from cluster import CONTROL, WorldTest, get, kubectl, leader, needs_the_machine, pods, signal_pod, wait_for
+from cluster import CONTROL, WorldTest, deploy, get, kubectl, leader, needs_the_machine, pods, signal_pod, wait_for
 
 TAKEN_OVER_S = 20
 
@@ -13,6 +13,9 @@ class Leader(WorldTest):
     file = "demo.json"
 
     def setUp(self):
+        # Containers that were killed before would be started again later than these.
+        kubectl("rollout", "restart", "deployment/aureole-control")
+        deploy()
         super().setUp()
         wait_for(lambda: self.world.ticks.now() > 100, "tick 100")
         self.before = self.world.incarnations()
