@@ -218,7 +218,7 @@ RegionSnapshot Region::Snapshot() const {
 }
 
 std::string Region::Save() const {
-  AUREOLE_CHECK(phase() == Phase::kBegin, "checkpoint of region %d within tick %lld", self(),
+  AUREOLE_CHECK(phase() == Phase::kBegin || phase() == Phase::kLeft, "checkpoint of region %d within tick %lld", self(),
                 static_cast<long long>(tick()));
   std::string out;
   Writer writer(&out);

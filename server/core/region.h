@@ -107,8 +107,8 @@ class Region {
   // `engine` holds the world's environment and no dynamic body; the region loads its share of the initial state.
   // `world` outlives the region.
   Region(const World& world, RegionId self, std::unique_ptr<Engine> engine);
-  // The region that Save wrote, at the end of the tick after which it did. `engine` as above. InvalidArgument when the
-  // bytes are not of this region and world.
+  // The region that Save wrote, at the end of the tick after which it did, in the same phase. `engine` as above.
+  // InvalidArgument when the bytes are not of this region and world.
   static absl::StatusOr<std::unique_ptr<Region>> Load(const World& world, RegionId self, std::unique_ptr<Engine> engine,
                                                       std::string_view saved);
   // A region that joins a world that runs (k = 0), with the layout that the change describes: one that does not name
@@ -176,7 +176,7 @@ class Region {
 
   // All that decides this region's future, after a tick: given the frames of its peers that it has not taken yet, and
   // the inputs that are offered to it from here on, a region that is loaded from this does bit for bit what this one
-  // does. Precondition: the phase is kBegin. Linear in the bodies.
+  // does. Precondition: the phase is kBegin or kLeft. Linear in the bodies.
   std::string Save() const;
   // Frames of this peer that were taken by phases since the beginning of the world, by this region and those that it
   // was loaded from. Those that only wait are not in Save, and must come again after Load. Counted anew when a peer

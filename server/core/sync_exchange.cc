@@ -38,7 +38,7 @@ class SyncExchange final : public Protocol {
       : h_(holdings),
         gather_(h_.division.now().members, h_.self),
         open_(h_.peers.size()),
-        phase_(joins ? Phase::kJoin : Phase::kBegin) {}
+        phase_(joins ? Phase::kJoin : BetweenTicks()) {}
 
   Phase phase() const override { return phase_; }
 
@@ -80,7 +80,7 @@ class SyncExchange final : public Protocol {
         h_.MeasureSlack(now());
         h_.engine->Step(now());
         ++h_.tick;
-        phase_ = Next().IsMember(h_.self) ? Phase::kBegin : Phase::kLeft;
+        phase_ = BetweenTicks();
     }
   }
 
@@ -187,6 +187,8 @@ class SyncExchange final : public Protocol {
 
   // In force in the next tick.
   const Division::State& Next() const { return *h_.division.At(now(), h_.tick); }
+
+  Phase BetweenTicks() const { return Next().IsMember(h_.self) ? Phase::kBegin : Phase::kLeft; }
 
   // Of a region that joins: who has sent the welcome; kNoRegion: nobody yet.
   RegionId Sponsor() const {

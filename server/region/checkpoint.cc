@@ -9,12 +9,12 @@ namespace aureole {
 
 template <class Archive>
 void Visit(Archive& a, LinkState& v) {
-  a(v.applied, v.first, v.kept);
+  a(v.epoch, v.applied, v.first, v.kept);
 }
 
 namespace {
 
-constexpr uint64_t kMagic = 0x3154504b43524100;  // of this layout of the bytes
+constexpr uint64_t kMagic = 0x3254504b43524100;  // of this layout of the bytes
 
 template <class Archive>
 void VisitCheckpoint(Archive& a, Checkpoint& c) {
@@ -25,7 +25,7 @@ void VisitCheckpoint(Archive& a, Checkpoint& c) {
 
 Checkpoint TakeCheckpoint(uint64_t world_hash, const Region& region, const RegionLinks& links) {
   Checkpoint out{world_hash, region.self(), region.tick(), region.Save(), links.States(), {}};
-  for (auto& [peer, link] : out.links) link.applied = region.FramesTaken(peer);
+  for (RegionId peer : region.peers()) out.links.at(peer).applied = region.FramesTaken(peer);
   return out;
 }
 

@@ -37,7 +37,7 @@ struct Checkpoint {
   std::vector<Hash> hashes;  // of the ticks just before, which may not have been reported
 };
 
-// Of a region after a tick, at the beginning of the next.
+// Of a region after a tick, at the beginning of the next or when it has left.
 Checkpoint TakeCheckpoint(uint64_t world_hash, const Region& region, const RegionLinks& links);
 
 // With a check sum. Linear; tens of megabytes for the largest regions, so not for the tick thread.

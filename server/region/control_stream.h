@@ -17,7 +17,7 @@
 namespace aureole {
 
 struct Event {
-  enum class Kind { kMessage, kControlLost, kSignal, kFenced };
+  enum class Kind { kMessage, kControlLost, kSignal, kFenced, kGone };
   Kind kind = Kind::kMessage;
   v1::ToRegion message;
   std::string reason;    // why the stream ended

@@ -7,6 +7,7 @@
 #include <spdlog/spdlog.h>
 
 #include "server/physics/bullet_engine.h"
+#include "server/transport/input_codec.h"
 #include "server/transport/link_limits.h"
 #include "server/transport/world_spec.h"
 
@@ -17,7 +18,7 @@ LinkIdentity IdentityOf(const v1::Assignment& assignment, const World& world) {
   LinkIdentity identity;
   identity.protocol_version = kPeerProtocolVersion;
   identity.world_hash = WorldHash(assignment.world());
-  identity.layout_epoch = assignment.layout_epoch();
+  identity.layout_epoch = assignment.has_join() ? assignment.join().epoch() : kFirstLayoutEpoch;
   identity.self = assignment.region();
   identity.incarnation = assignment.incarnation();
   identity.exchange_delay = world.exchange.k;
@@ -37,14 +38,15 @@ absl::StatusOr<std::unique_ptr<HostedRegion>> HostedRegion::Load(const v1::Assig
     if (!one.ok()) return one.status();
     world->layout = *std::move(one);
   }
-  const int regions = world->layout.size();
+  // The list only grows with the layouts of a world.
+  const int first_regions = world->layout.size(), regions = assignment.endpoints_size();
+  if (regions < first_regions || regions > limits::kMaxRegions) {
+    return absl::InvalidArgumentError(
+        absl::StrCat("assignment.endpoints: has ", regions, " entries, the world has ", first_regions, " regions"));
+  }
   if (assignment.region() < 0 || assignment.region() >= regions) {
     return absl::InvalidArgumentError(
         absl::StrCat("assignment.region: is ", assignment.region(), ", the world has ", regions, " regions"));
-  }
-  if (assignment.endpoints_size() != regions) {
-    return absl::InvalidArgumentError(absl::StrCat("assignment.endpoints: has ", assignment.endpoints_size(),
-                                                   " entries, the world has ", regions, " regions"));
   }
   if (assignment.incarnation() == 0) {
     return absl::InvalidArgumentError("assignment.incarnation: must be at least 1");
@@ -77,33 +79,77 @@ absl::Status HostedRegion::LoadRegion(const std::filesystem::path& data) {
     if (!journal.ok()) return journal.status();
     journal_ = *std::move(journal);
   }
-  std::map<RegionId, LinkState> states;
-  if (assignment_.recover()) {
-    absl::StatusOr<Journal::Recovered> found = journal_->Recover(WorldHash(assignment_.world()), assignment_.region());
-    if (!found.ok()) return found.status();
-    absl::StatusOr<std::unique_ptr<Region>> region =
-        Region::Load(world_, assignment_.region(), MakeBulletEngine(world_.environment), found->checkpoint.state);
-    if (!region.ok()) return region.status();
-    region_ = *std::move(region);
-    states = std::move(found->checkpoint.links);
-    replay_ = std::move(found->inputs);
-    hashes_ = std::move(found->checkpoint.hashes);
-  } else {
-    region_ = std::make_unique<Region>(world_, assignment_.region(), MakeBulletEngine(world_.environment));
-  }
+  absl::Status s = assignment_.recover() ? Recover() : absl::NotFoundError("a first life");
+  const bool joins = assignment_.has_join() && absl::IsNotFound(s);
+  if (!assignment_.recover() || joins) s = MakeRegion();
+  if (!s.ok()) return s;
   const auto log = [](RegionId peer, const std::string& what) { spdlog::info("link to region {}: {}", peer, what); };
   LinkIdentity identity = IdentityOf(assignment_, world_);
   if (!replay_.empty()) identity.log_until = replay_.back().tick;
-  links_ = std::make_unique<RegionLinks>(identity, region_->peers(), log, keep, std::move(states));
-  for (RegionId peer : region_->peers()) {
-    if (peer < assignment_.incarnations_size()) links_->Redirect(peer, "", assignment_.incarnations(peer));
+  links_ = std::make_unique<RegionLinks>(identity, region_->peers(), log, keep, std::move(link_states_));
+  for (RegionId peer = 0; peer < assignment_.incarnations_size(); ++peer) {
+    links_->Redirect(peer, "", assignment_.incarnations(peer));
   }
-  if (!keep || assignment_.recover()) return absl::OkStatus();
+  if (!keep || recovered_) return absl::OkStatus();
+  // What is here may be of another region that had this name. One that joins begins its journal when it has.
+  if (joins) return journal_->Clear();
   return journal_->Begin(TakeCheckpoint(WorldHash(assignment_.world()), *region_, *links_));
+}
+
+absl::Status HostedRegion::Recover() {
+  absl::StatusOr<Journal::Recovered> found = journal_->Recover(WorldHash(assignment_.world()), assignment_.region());
+  if (!found.ok()) return found.status();
+  absl::StatusOr<std::unique_ptr<Region>> region =
+      Region::Load(world_, assignment_.region(), MakeBulletEngine(world_.environment), found->checkpoint.state);
+  if (!region.ok()) return region.status();
+  region_ = *std::move(region);
+  link_states_ = std::move(found->checkpoint.links);
+  replay_ = std::move(found->inputs);
+  hashes_ = std::move(found->checkpoint.hashes);
+  recovered_ = true;
+  return absl::OkStatus();
+}
+
+absl::Status HostedRegion::MakeRegion() {
+  std::unique_ptr<Engine> engine = MakeBulletEngine(world_.environment);
+  if (!assignment_.has_join()) {
+    if (assignment_.region() >= world_.layout.size()) {
+      return absl::InvalidArgumentError(absl::StrCat("assignment.region: is ", assignment_.region(),
+                                                     ", which the world does not begin with; set assignment.join"));
+    }
+    region_ = std::make_unique<Region>(world_, assignment_.region(), std::move(engine));
+    return absl::OkStatus();
+  }
+  LayoutChange change;
+  absl::Status s = DecodeLayoutChange(assignment_.join(), &change);
+  if (s.ok()) {
+    absl::StatusOr<std::unique_ptr<Region>> region =
+        Region::Join(world_, assignment_.region(), std::move(engine), change);
+    s = region.status();
+    if (s.ok()) region_ = *std::move(region);
+  }
+  return s.ok() ? s : absl::Status(s.code(), absl::StrCat("assignment.join.", s.message()));
 }
 
 void HostedRegion::PeerMoved(const v1::PeerMoved& moved) {
   links_->Redirect(moved.region(), moved.endpoint(), moved.incarnation());
+  if (moved.joins() != 0) links_->Expect(moved.region(), moved.joins());
+}
+
+void HostedRegion::PeerLeft(const v1::PeerLeft& left) { links_->Forget(left.region()); }
+
+absl::Status HostedRegion::ChangeLayout(const v1::ChangeLayout& change) {
+  if (loop_ == nullptr) return absl::FailedPreconditionError("change_layout: before the Start");
+  auto layout = std::make_shared<aureole::LayoutChange>();
+  if (absl::Status s = DecodeLayoutChange(change.layout(), layout.get()); !s.ok()) return s;
+  Input input;
+  input.source = kControlSource;
+  input.sequence = change.sequence();
+  input.kind = Input::Kind::kLayout;
+  input.layout = std::move(layout);
+  if (absl::Status s = CheckLiveInput(input); !s.ok()) return s;
+  loop_->Offer(input);
+  return absl::OkStatus();
 }
 
 HostedRegion::~HostedRegion() { Stop(); }
@@ -120,7 +166,7 @@ void HostedRegion::Start(int64_t start_unix_us, TickLoop::Hooks hooks) {
   options.hash_every = assignment_.hash_every();
   options.checkpoint_every = assignment_.checkpoint_every();
   options.world_hash = WorldHash(assignment_.world());
-  options.recovered = assignment_.recover();
+  options.recovered = recovered_;
   options.replay = std::move(replay_);
   options.hashes = std::move(hashes_);
   loop_ = std::make_unique<TickLoop>(world_, region_.get(), links_.get(), journal_.get(), std::move(options),

@@ -19,9 +19,10 @@ namespace aureole {
 
 class HostedRegion {
  public:
-  // Loads the world and the region's share of it, or, when the assignment says `recover`, what the journal has of it.
-  // `data`: directory for the journal; needed when the assignment asks for checkpoints. InvalidArgument when the
-  // assignment makes no sense, else the journal's errors.
+  // Loads the world and the region's share of it, or, when the assignment says `recover`, what the journal has of it;
+  // one that is to join a world that runs, and has not done so yet, is empty. `data`: directory for the journal; needed
+  // when the assignment asks for checkpoints. InvalidArgument when the assignment makes no sense, else the journal's
+  // errors.
   static absl::StatusOr<std::unique_ptr<HostedRegion>> Load(const v1::Assignment& assignment,
                                                             const std::filesystem::path& data);
   // Stops and joins the tick thread, and closes the links.
@@ -44,18 +45,25 @@ class HostedRegion {
   Progress progress() const;
   // The next report says again what may not have been heard. Any thread.
   void SayAgain();
-  // The peer's next incarnation is there.
+  // The peer's next incarnation is there; or a region is that will be a peer.
   void PeerMoved(const v1::PeerMoved& moved);
+  void PeerLeft(const v1::PeerLeft& left);
+  // Offers the change to the world, once the tick thread runs. InvalidArgument when it is none.
+  absl::Status ChangeLayout(const v1::ChangeLayout& change);
   // Ends the tick thread. Idempotent.
   void Stop();
 
  private:
   HostedRegion(const v1::Assignment& assignment, World world);
   absl::Status LoadRegion(const std::filesystem::path& data);
+  absl::Status Recover();
+  absl::Status MakeRegion();
 
   const v1::Assignment assignment_;
   const World world_;
   std::unique_ptr<Journal> journal_;  // null: no checkpoints
+  bool recovered_ = false;            // from a checkpoint
+  std::map<RegionId, LinkState> link_states_;
   std::vector<LoggedInput> replay_;
   std::vector<Checkpoint::Hash> hashes_;
   std::unique_ptr<Region> region_;

@@ -223,7 +223,7 @@ absl::StatusOr<Journal::Recovered> Journal::Recover(uint64_t world_hash, RegionI
   return out;
 }
 
-absl::Status Journal::Begin(const Checkpoint& first) {
+absl::Status Journal::Clear() {
   std::error_code error;
   for (const auto& [incarnation, path] : Incarnations()) {
     if (incarnation > incarnation_) {
@@ -231,6 +231,12 @@ absl::Status Journal::Begin(const Checkpoint& first) {
     }
     std::filesystem::remove_all(path, error);
   }
+  return SyncDirectory(root_);
+}
+
+absl::Status Journal::Begin(const Checkpoint& first) {
+  if (absl::Status s = Clear(); !s.ok()) return s;
+  std::error_code error;
   if (!std::filesystem::create_directory(directory_, error)) {
     return absl::UnavailableError(absl::StrCat("cannot make ", directory_.string(), ": ", error.message()));
   }
@@ -334,7 +340,7 @@ void Journal::WriteCheckpoints() {
       stats_.write_ms = ms;
       stats_.last_failure.clear();
       Used used;
-      for (const auto& [peer, link] : checkpoint.links) used[peer] = link.applied;
+      for (const auto& [peer, link] : checkpoint.links) used[peer] = {link.epoch, link.applied};
       durable_ = std::move(used);
       DropSegments(checkpoint.tick);
     } else {

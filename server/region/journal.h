@@ -51,7 +51,7 @@ class Journal {
     std::string last_failure;  // empty: the last thing that was written is durable
   };
   // What a durable checkpoint has used of each peer's frames: they need not be kept any more.
-  using Used = std::map<RegionId, uint64_t>;
+  using Used = std::map<RegionId, LinkMark>;
 
   // Makes the directory when it is missing. Unavailable: it cannot be made, or nothing can be written there.
   static absl::StatusOr<std::unique_ptr<Journal>> Open(const std::filesystem::path& directory, uint64_t incarnation);
@@ -63,7 +63,9 @@ class Journal {
   // What the incarnation before has left, which is fenced. NotFound: no checkpoint. DataLoss: it, or the log, is
   // damaged. FailedPrecondition: of another world or region. Aborted: a later incarnation is here, or was.
   absl::StatusOr<Recovered> Recover(uint64_t world_hash, RegionId region);
-  // Forgets what is here of all incarnations, and waits until the first checkpoint is durable.
+  // Forgets what is here of all incarnations. Aborted: a later one is here.
+  absl::Status Clear();
+  // The same, and waits until the first checkpoint is durable.
   absl::Status Begin(const Checkpoint& first);
 
   // The tick thread. Starts to make inputs durable that will be offered in tick n; ticks do not descend.

@@ -170,13 +170,29 @@ bool Process::Report(const v1::Report& report) {
   return control->Send(std::move(message));
 }
 
+v1::FromRegion LayoutOutcomeOf(const InputOutcome& outcome) {
+  v1::FromRegion message;
+  v1::LayoutOutcome* out = message.mutable_layout_outcome();
+  out->set_sequence(outcome.name.second);
+  out->set_tick(outcome.tick);
+  out->set_refused(outcome.refused);
+  return message;
+}
+
 TickLoop::Hooks Process::Hooks() {
   TickLoop::Hooks hooks;
   hooks.after_tick = [this](const FrameSample& sample) {
     if (metrics != nullptr) metrics->AddTick(sample);
   };
   hooks.inputs = [this] { return simulation.inputs().Take(); };
-  hooks.outcomes = [this](const std::vector<InputOutcome>& outcomes) { simulation.inputs().Settle(outcomes); };
+  hooks.outcomes = [this](const std::vector<InputOutcome>& outcomes) {
+    simulation.inputs().Settle(outcomes);
+    for (const InputOutcome& outcome : outcomes) {
+      if (outcome.name.first != kControlSource) continue;
+      const std::lock_guard lock(control_mutex);
+      control->Send(LayoutOutcomeOf(outcome));
+    }
+  };
   hooks.publish = [this](Region* region, int64_t bodies, const std::vector<Input>& delivered) {
     simulation.inputs().Hear(delivered);
     simulation.AfterTick(region, bodies);
@@ -202,6 +218,11 @@ TickLoop::Hooks Process::Hooks() {
     events.Push(std::move(event));
   };
   hooks.log = [](const std::string& what) { spdlog::warn("{}", what); };
+  hooks.gone = [this] {
+    Event event;
+    event.kind = Event::Kind::kGone;
+    events.Push(std::move(event));
+  };
   return hooks;
 }
 
@@ -218,6 +239,7 @@ absl::Status Process::Handle(const v1::ToRegion& message) {
     if (hosted != nullptr) return absl::FailedPreconditionError("a second assignment");
     const v1::Assignment& assignment = message.assignment();
     for (const std::string& peer : assignment.endpoints()) {
+      if (peer.empty()) continue;
       if (absl::Status s = security->CheckDial(peer); !s.ok()) return s;
     }
     absl::StatusOr<std::unique_ptr<HostedRegion>> loaded = HostedRegion::Load(assignment, data);
@@ -249,6 +271,13 @@ absl::Status Process::Handle(const v1::ToRegion& message) {
     spdlog::info("region {} is incarnation {} now, at {}", message.peer_moved().region(),
                  message.peer_moved().incarnation(), message.peer_moved().endpoint());
     hosted->PeerMoved(message.peer_moved());
+  } else if (message.has_peer_left()) {
+    if (hosted == nullptr) return absl::FailedPreconditionError("a peer has left before the assignment");
+    spdlog::info("region {} has left", message.peer_left().region());
+    hosted->PeerLeft(message.peer_left());
+  } else if (message.has_change_layout()) {
+    if (hosted == nullptr) return absl::FailedPreconditionError("a change of the layout before the assignment");
+    return hosted->ChangeLayout(message.change_layout());
   }
   return absl::OkStatus();
 }
@@ -284,6 +313,9 @@ bool HandleEvent(Process* process, const Event& event, int* exit_code, std::stri
     case Event::Kind::kFenced:
       *reason = "fenced: a later incarnation has taken over the checkpoints";
       *exit_code = 1;
+      return false;
+    case Event::Kind::kGone:
+      *reason = "the region has left its world";
       return false;
     case Event::Kind::kMessage:
       break;

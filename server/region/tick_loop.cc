@@ -15,6 +15,7 @@ using std::chrono::milliseconds;
 constexpr milliseconds kReportEvery(200);
 constexpr milliseconds kWaitIsWorthTelling(100);  // in reports
 constexpr milliseconds kWaitIsWorthLogging(1000);
+constexpr milliseconds kLookEvery(20);      // whether a region that has left may go
 constexpr milliseconds kLongestSleep(100);  // so that Stop is heard
 // A world that is later than this, because a server was overloaded or dead, does not try to make it up: nobody wants to
 // watch the lost time run past.
@@ -62,16 +63,72 @@ bool TickLoop::Run() {
   start_ = Clock::now() + until_start;
   reported_at_ = Clock::now();
   reported_tick_ = region_->tick();
+  FollowLayout();
   const auto done = [this] { return options_.last_tick > 0 && region_->tick() >= options_.last_tick; };
-  while (!done() && SleepUntilDue(region_->tick() + 1)) {
+  const auto left = [this] { return region_->phase() == Phase::kLeft; };
+  if (!Join()) return false;
+  while (!done() && !left() && SleepUntilDue(region_->tick() + 1)) {
     EndLap();
     if (!RunTick()) break;
     AfterTick();
     if (Clock::now() - reported_at_ >= kReportEvery || pending_.windows_size() > 0) Report({}, false);
   }
   EndLap();
+  if (left() && !done()) Leave();
   Report({}, done());
   return done();
+}
+
+void TickLoop::Offer(const Input& change) {
+  const std::lock_guard lock(offers_mutex_);
+  offers_.push_back(change);
+}
+
+// Until the welcome has come; false when stopped. Reports say whom the region has not met yet: before it has met all,
+// the world should not hear of the change with which it joins.
+bool TickLoop::Join() {
+  if (region_->phase() != Phase::kJoin) return true;
+  while (!region_->Ready() && !stopped_) {
+    Take(Clock::now() + kReportEvery / 2);
+    if (Clock::now() - reported_at_ < kReportEvery) continue;
+    missing_.clear();
+    links_->Unmet(&missing_);
+    Report(missing_, false);
+  }
+  if (stopped_) return false;
+  region_->Advance(&out_);
+  checkpointed_ = reported_tick_ = region_->tick();
+  if (journal_ != nullptr) {
+    // Before anybody hears of it, so the next incarnation joins again, or goes on from here.
+    const absl::Status s = journal_->Begin(TakeCheckpoint(options_.world_hash, *region_, *links_));
+    if (!s.ok()) hooks_.log(absl::StrCat("the first checkpoint: ", std::string(s.message())));
+  }
+  FollowLayout();
+  hooks_.log(absl::StrCat("joined after tick ", region_->tick()));
+  return true;
+}
+
+// What the others may need stays until they do not: their last word is durable here, and this region's there.
+void TickLoop::Leave() {
+  hooks_.log(absl::StrCat("left after tick ", region_->tick()));
+  links_->Part();
+  while (!stopped_) {
+    const bool durable = journal_ == nullptr || journal_->stats().durable_tick >= region_->tick();
+    if (journal_ != nullptr) TellDurable();
+    if (durable && links_->released()) break;
+    if (!durable) Checkpoint(0);
+    Take(Clock::now() + kLookEvery);
+    if (Clock::now() - reported_at_ >= kReportEvery) Report({}, false);
+  }
+  if (!stopped_ && hooks_.gone) hooks_.gone();
+}
+
+// Links to those that come and from those that go.
+void TickLoop::FollowLayout() {
+  if (region_->layout_epoch() == followed_epoch_ && region_->next_layout_at() == followed_next_) return;
+  followed_epoch_ = region_->layout_epoch();
+  followed_next_ = region_->next_layout_at();
+  links_->Follow(followed_epoch_, region_->members(), region_->next_members());
 }
 
 bool TickLoop::SleepUntilDue(Tick n) {
@@ -91,7 +148,10 @@ bool TickLoop::SleepUntilDue(Tick n) {
 
 bool TickLoop::RunTick() {
   const Tick n = region_->tick() + 1;
-  if (journal_ != nullptr) Checkpoint();
+  if (journal_ != nullptr) {
+    TellDurable();
+    Checkpoint(options_.checkpoint_every);
+  }
   OfferInputs();
   // An input that this one has logged in vain the later one may have found, and will tell in this tick.
   if (journal_ != nullptr && journal_->fenced()) {
@@ -105,6 +165,7 @@ bool TickLoop::RunTick() {
     links_->Send(out_);
   }
   lap_of_ = n;
+  FollowLayout();
   return true;
 }
 
@@ -126,6 +187,11 @@ void TickLoop::OfferInputs() {
   // that another region's log still holds for later ticks.
   if (replaying_ || n <= log_until_ || region_->inputs_waiting() > 0) return;
   std::vector<Input> inputs = hooks_.inputs();
+  {
+    const std::lock_guard lock(offers_mutex_);
+    inputs.insert(inputs.end(), offers_.begin(), offers_.end());
+    offers_.clear();
+  }
   if (journal_ == nullptr) {
     for (const Input& input : inputs) Submit(input);
   } else if (!inputs.empty()) {
@@ -141,9 +207,13 @@ void TickLoop::Submit(const Input& input) {
   }
 }
 
-void TickLoop::Checkpoint() {
+void TickLoop::TellDurable() {
   if (const std::optional<Journal::Used> used = journal_->TakeDurable()) links_->SetDurable(*used);
-  if (region_->tick() < checkpointed_ + options_.checkpoint_every || journal_->writing()) return;
+}
+
+// Unless the last one is not yet so many ticks old, or still being written.
+void TickLoop::Checkpoint(Tick after) {
+  if (region_->tick() < checkpointed_ + after || journal_->writing()) return;
   const Clock::time_point since = Clock::now();
   aureole::Checkpoint checkpoint = TakeCheckpoint(options_.world_hash, *region_, *links_);
   const size_t kept = std::min(recent_hashes_.size(), kCheckpointHashes);
@@ -225,7 +295,9 @@ bool TickLoop::AwaitPeers() {
 void TickLoop::Take(Clock::time_point deadline) {
   missing_.clear();
   region_->Missing(&missing_);
-  links_->Receive(missing_.size(), deadline, &in_);
+  // Who joins needs one welcome, of whomever; who has left needs nothing.
+  const bool ticks = region_->phase() != Phase::kJoin && region_->phase() != Phase::kLeft;
+  links_->Receive(ticks ? missing_.size() : 1, deadline, &in_);
   for (Frame& frame : in_) {
     const RegionId from = frame.from;
     const Tick tick = frame.tick;
@@ -322,6 +394,9 @@ void TickLoop::Report(const std::vector<RegionId>& waiting_for, bool finished) {
   r.mutable_waiting_for()->Add(waiting_for.begin(), waiting_for.end());
   r.set_finished(finished);
   r.set_replaying(replaying_);
+  r.set_layout_epoch(region_->phase() == Phase::kJoin ? 0 : region_->layout_epoch());
+  r.set_layout_pending(region_->next_layout_at() != 0);
+  r.set_left(region_->phase() == Phase::kLeft);
   r.set_lost_us(std::chrono::duration_cast<microseconds>(lost_).count());
   if (journal_ != nullptr) {
     const Journal::Stats journal = journal_->stats();

@@ -6,6 +6,7 @@
 #include <cstdint>
 #include <deque>
 #include <functional>
+#include <mutex>
 #include <string>
 #include <vector>
 
@@ -49,13 +50,19 @@ class TickLoop {
     std::function<void(const v1::Report&, bool heard)> epilogue;
     std::function<void(const std::string&)> log;  // waits over 1 s, violations, refused frames
     std::function<void()> fenced;                 // with a journal: a later incarnation has taken over; the loop ends
+    // The region has left its world, and nobody can need its frames any more. May be empty.
+    std::function<void()> gone = nullptr;
   };
 
   // All outlive the loop. `journal`: null for none.
   TickLoop(const World& world, Region* region, RegionLinks* links, Journal* journal, Options options, Hooks hooks);
 
-  // Runs to the last tick or until Stop; then sends a last report. True when the last tick was reached.
+  // Runs to the last tick, until the region has left, or until Stop; then sends a last report. A region that joins
+  // waits for its welcome first; one that has left stays until nobody needs its frames. True when the last tick was
+  // reached.
   bool Run();
+  // From any thread. A change of the layout, offered to the region like an input of a client.
+  void Offer(const Input& change);
   // From any thread, also before Run; Run returns soon after.
   void Stop();
   // From any thread: the next report says the newest hashes again, which may not have been heard.
@@ -67,11 +74,15 @@ class TickLoop {
  private:
   using Clock = RegionLinks::Clock;
 
+  bool Join();
+  void Leave();
+  void FollowLayout();
   bool SleepUntilDue(Tick n);
   bool RunTick();
   void OfferInputs();
   void Submit(const Input& input);
-  void Checkpoint();
+  void TellDurable();
+  void Checkpoint(Tick after);
   void EndReplay();
   void AddHash(const aureole::Checkpoint::Hash& h);
   void AppendHash(const aureole::Checkpoint::Hash& h);
@@ -92,6 +103,8 @@ class TickLoop {
   std::atomic<bool> stopped_ = false, say_again_ = false;
   std::atomic<Tick> said_tick_;
   std::atomic<int64_t> said_bodies_;
+  std::mutex offers_mutex_;
+  std::vector<Input> offers_;
 
   FrameClock clock_;
   WindowMeter windows_;
@@ -106,6 +119,8 @@ class TickLoop {
   std::vector<Input> logged_;  // being made durable, for the next tick
   Tick checkpointed_ = 0;
   Tick log_until_ = 0;                                   // of all regions that were loaded with this one
+  uint64_t followed_epoch_ = 0;  // 0: none yet
+  Tick followed_next_ = 0;
   std::deque<aureole::Checkpoint::Hash> recent_hashes_;  // that may not have reached the control plane
   Clock::duration longest_pause_{}, lost_{};
   Clock::time_point reported_at_;

@@ -267,6 +267,9 @@ void RecordInputs(const std::vector<Input>& inputs, google::protobuf::RepeatedPt
   }
 }
 
+void EncodeLayoutChange(const LayoutChange& change, v1::LayoutChange* out) { Encode(change, out); }
+absl::Status DecodeLayoutChange(const v1::LayoutChange& in, LayoutChange* out) { return Decode(in, out); }
+
 absl::Status ReadRecordedInput(const v1::Input& in, Input* out) {
   AUREOLE_RETURN_IF_ERROR(Decode(in, nullptr, out));
   if (out->kind == Input::Kind::kLayout) return Bad("kind", "the layout changes nothing that is recorded");

@@ -17,6 +17,10 @@ void EncodeInputs(const std::vector<Input>& inputs, google::protobuf::RepeatedPt
 // InvalidArgument names the field when it is no list that clients can have given and EncodeInputs have written.
 absl::Status DecodeInputs(const google::protobuf::RepeatedPtrField<v1::Input>& in, std::vector<Input>* out);
 
+// A change of the layout alone. That it is a layout, only LayoutOf says.
+void EncodeLayoutChange(const LayoutChange& change, v1::LayoutChange* out);
+absl::Status DecodeLayoutChange(const v1::LayoutChange& in, LayoutChange* out);
+
 // With their ticks and the ids of spawned bodies, for recordings; shapes as EncodeInputs tells them.
 void RecordInputs(const std::vector<Input>& inputs, google::protobuf::RepeatedPtrField<v1::Input>* out);
 // Of one with its shape.

@@ -154,7 +154,23 @@ void PeerLink::SetDurable(uint64_t frames) {
 
 LinkState PeerLink::State() const {
   const std::lock_guard lock(mutex_);
-  return {0, sender_.first(), sender_.messages()};
+  return {epoch(), parted_ ? receiver_.applied() : 0, sender_.first(), sender_.messages()};
+}
+
+void PeerLink::Part() {
+  const std::lock_guard lock(mutex_);
+  parted_ = true;
+  if (current_ != nullptr) Pump(current_);
+}
+
+bool PeerLink::released() const {
+  const std::lock_guard lock(mutex_);
+  return sender_.kept() == 0;
+}
+
+bool PeerLink::met() const {
+  const std::lock_guard lock(mutex_);
+  return peer_met_;
 }
 
 bool PeerLink::caught_up() const {
@@ -413,7 +429,8 @@ void PeerLink::LogOnce(const std::string& why) {
 // Holds the mutex. Starts the next write, if there is one and none is in flight.
 void PeerLink::Pump(LinkStream* stream) {
   if (stream->ended || !stream->open || stream->writing) return;
-  const bool acknowledge = options_.keep ? durable_ > told_durable_ : receiver_.applied() - told_ >= kAcknowledgeEvery;
+  const uint64_t due = parted_ ? 1 : kAcknowledgeEvery;
+  const bool acknowledge = options_.keep ? durable_ > told_durable_ : receiver_.applied() - told_ >= due;
   if (stream->queue.empty() && !acknowledge) return;
   v1::PeerMessage& out = stream->out;
   out.Clear();

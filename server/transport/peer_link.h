@@ -35,7 +35,7 @@ namespace aureole {
 struct LinkIdentity {
   uint32_t protocol_version = 0;
   uint64_t world_hash = 0;
-  uint64_t layout_epoch = 0;
+  uint64_t layout_epoch = 0;  // of the layout with which the two became peers
   RegionId self = kNoRegion;
   uint64_t incarnation = 1;  // from 1
   int exchange_delay = 0;    // k
@@ -52,9 +52,16 @@ using EncodedFrame = std::shared_ptr<const std::string>;
 
 // What of a link goes into a checkpoint.
 struct LinkState {
+  uint64_t epoch = 0;             // LinkIdentity::layout_epoch
   uint64_t applied = 0;           // frames of the peer
   uint64_t first = 1;             // number of kept.front()
   std::deque<EncodedFrame> kept;  // frames that the peer may yet need
+};
+
+// So many frames of the peer, on the link of this epoch.
+struct LinkMark {
+  uint64_t epoch = 0, frames = 0;
+  friend bool operator==(const LinkMark&, const LinkMark&) = default;
 };
 
 // Totals since the start.
@@ -116,6 +123,8 @@ class PeerLink {
   PeerLink& operator=(const PeerLink&) = delete;
 
   RegionId peer() const { return options_.peer; }
+  // Of the layout with which the two regions became peers.
+  uint64_t epoch() const { return options_.identity.layout_epoch; }
 
   // Connects, and stays connected until Close. Once; only the side with the lower id.
   void Dial(const std::string& endpoint,
@@ -127,8 +136,16 @@ class PeerLink {
   void Send(EncodedFrame frame);
   // Frames of the peer are durable here up to this number.
   void SetDurable(uint64_t frames);
-  // What is kept for the peer; `applied` is left 0: it is the reader of the frames that knows what it has used.
+  // What is kept for the peer; `applied` is left 0: it is the reader of the frames that knows what it has used. After
+  // Part it is all that came.
   LinkState State() const;
+  // The two are no peers any more: all that came was used, and nothing more is sent. The link stays until the other
+  // side has what it needs; what came is acknowledged at once, or when it is durable.
+  void Part();
+  // The peer needs no frame again that it was sent.
+  bool released() const;
+  // The peer, this incarnation of it, has been connected.
+  bool met() const;
   // The peer was met, and has had no frame of an earlier incarnation of this region that this one has not sent again.
   bool caught_up() const;
   // The last tick of the peer's log of inputs, as its hellos said.
@@ -184,6 +201,7 @@ class PeerLink {
   LinkReceiver receiver_;
   uint64_t told_ = 0;  // what the peer knows that we applied
   uint64_t durable_ = 0, told_durable_ = 0;
+  bool parted_ = false;
   bool peer_met_ = false;    // this incarnation of it
   bool peer_keeps_ = false;  // as its hello says
   Tick peer_log_until_ = 0;

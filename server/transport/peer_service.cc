@@ -67,6 +67,17 @@ void PeerService::Serve(const LinkIdentity& identity, const std::vector<PeerLink
   serving_ = true;
 }
 
+void PeerService::Add(PeerLink* link) {
+  const std::lock_guard lock(mutex_);
+  links_[link->peer()] = link;
+}
+
+void PeerService::Remove(const PeerLink* link) {
+  const std::lock_guard lock(mutex_);
+  const auto it = links_.find(link->peer());
+  if (it != links_.end() && it->second == link) links_.erase(it);
+}
+
 void PeerService::Stop() {
   const std::lock_guard lock(mutex_);
   serving_ = false;
@@ -92,10 +103,13 @@ absl::Status PeerService::Attach(LinkStream* stream, const v1::PeerMessage& firs
   return s;
 }
 
-// Holds the mutex. What the two servers must agree on comes first: the caller's ids mean nothing without it.
+// Holds the mutex. What the two servers must agree on comes first: the caller's ids mean nothing without it. Since when
+// the two are peers, the link knows.
 absl::StatusOr<PeerLink*> PeerService::Find(const v1::PeerMessage& first) const {
   if (!first.has_hello()) return absl::InvalidArgumentError("the first message is no hello");
-  if (absl::Status s = CheckHello(identity_, first.hello()); !s.ok()) return s;
+  LinkIdentity identity = identity_;
+  identity.layout_epoch = first.hello().layout_epoch();
+  if (absl::Status s = CheckHello(identity, first.hello()); !s.ok()) return s;
   const auto link = links_.find(first.hello().from());
   if (link != links_.end()) return link->second;
   return absl::FailedPreconditionError(absl::StrCat("link refused by region ", identity_.self, ": region ",

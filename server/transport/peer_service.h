@@ -21,6 +21,9 @@ class PeerService final : public v1::Peer::CallbackService {
 
   // From here on the peers of `links` are accepted. The links outlive the next Stop.
   void Serve(const LinkIdentity& identity, const std::vector<PeerLink*>& links);
+  // One more, or one less: no further stream is handed to it. Ignored when it is not there.
+  void Add(PeerLink* link);
+  void Remove(const PeerLink* link);
   // Hands no further stream to a link.
   void Stop();
 

@@ -20,8 +20,8 @@ constexpr uint64_t kWorld = 0xABC;
 
 Checkpoint CheckpointOf(Tick n, std::string state = "some state") {
   Checkpoint c{kWorld, 2, n, std::move(state), {}, {{n - 1, 77, 5}}};
-  c.links[0] = {10, 8, {std::make_shared<const std::string>("a frame"), std::make_shared<const std::string>("")}};
-  c.links[5] = {};
+  c.links[0] = {1, 10, 8, {std::make_shared<const std::string>("a frame"), std::make_shared<const std::string>("")}};
+  c.links[5].epoch = 4;
   return c;
 }
 
@@ -89,7 +89,7 @@ TEST_F(JournalTest, NextIncarnationFindsTheCheckpointAndTheInputsAfterIt) {
     j->Log(3, {Push(1), Push(2)});
     ASSERT_TRUE(j->AwaitLogged().ok());
     WriteAndWait(j.get(), CheckpointOf(3));
-    EXPECT_EQ(j->TakeDurable(), (Journal::Used{{0, 10}, {5, 0}}));
+    EXPECT_EQ(j->TakeDurable(), (Journal::Used{{0, {1, 10}}, {5, {4, 0}}}));
     EXPECT_EQ(j->TakeDurable(), std::nullopt);
     j->Log(4, {Push(3)});
     j->Log(6, {Push(4)});
