@@ -6,6 +6,7 @@
 
 #include <absl/strings/str_cat.h>
 
+#include "server/transport/input_codec.h"
 #include "server/transport/world_spec.h"
 
 namespace aureole {
@@ -188,6 +189,10 @@ absl::Status ControlService::Handle(Session* session, const v1::FromRegion& mess
       return HandleReady(session->region, message.ready());
     case v1::FromRegion::kReport:
       return HandleReport(record, message.report());
+    case v1::FromRegion::kLayoutOutcome:
+      layout_outcome_ = message.layout_outcome();
+      Changed();
+      return absl::OkStatus();
     case v1::FromRegion::kGoodbye:
       record->status.goodbye = message.goodbye().reason();
       return absl::OkStatus();
@@ -292,11 +297,12 @@ void ControlService::Assign(RegionId region) {
   v1::Assignment* a = message.mutable_assignment();
   *a->mutable_world() = plan_.world;
   for (const RegionRecord& record : regions_) {
-    a->add_endpoints(record.status.endpoint);
-    a->add_incarnations(record.status.incarnation);
+    a->add_endpoints(record.retired ? "" : record.status.endpoint);
+    a->add_incarnations(record.retired ? 0 : record.status.incarnation);
   }
+  if (to.joins.has_value()) *a->mutable_join() = *to.joins;
   a->set_region(region);
-  a->set_layout_epoch(1);
+  a->set_layout_epoch(layout_epoch_);
   a->set_incarnation(to.status.incarnation);
   a->set_checkpoint_every(plan_.checkpoint_every);
   a->set_recover(to.status.was_ready);
@@ -334,6 +340,8 @@ v1::ToRegion ControlService::Moved(RegionId region) const {
   moved->set_region(region);
   moved->set_endpoint(regions_[region].status.endpoint);
   moved->set_incarnation(regions_[region].status.incarnation);
+  const std::optional<v1::LayoutChange>& joins = regions_[region].joins;
+  if (joins.has_value() && joins->epoch() > layout_epoch_) moved->set_joins(joins->epoch());
   return message;
 }
 
@@ -355,7 +363,13 @@ absl::Status ControlService::HandleReady(RegionId region, const v1::Ready& ready
   record->status.report.set_bodies(ready.bodies());
   record->status.report.set_tick(ready.tick());
   record->status.report.clear_waiting_for();
-  if (record->status.incarnation > 1) TellMoved(region);
+  if (record->status.incarnation > 1 || record->joins.has_value()) TellMoved(region);
+  // Those that are to join it must know before the world hears of them.
+  for (size_t i = 0; i < regions_.size(); ++i) {
+    const auto other = static_cast<RegionId>(i);
+    const bool joins = !regions_[i].status.member && regions_[i].joins.has_value();
+    if (joins && regions_[i].status.ready && other != region) record->session->Send(Moved(other));
+  }
   if (stage_ == Stage::kRunning) {
     Start(record);
   } else {
@@ -432,12 +446,79 @@ absl::Status ControlService::HandleReport(RegionRecord* record, const v1::Report
   status.report.clear_violation_log();
   status.finished = report.finished();
   if (status.finished) {
-    if (std::all_of(regions_.begin(), regions_.end(), [](const RegionRecord& r) { return r.status.finished; })) {
-      stage_ = Stage::kFinished;
-    }
+    CheckFinished();
     Changed();
   }
   return absl::OkStatus();
+}
+
+void ControlService::CheckFinished() {
+  if (std::all_of(regions_.begin(), regions_.end(),
+                  [](const RegionRecord& r) { return r.status.finished || !r.status.member; })) {
+    stage_ = Stage::kFinished;
+  }
+}
+
+void ControlService::Admit(RegionId region, const LayoutChange& layout) {
+  const std::lock_guard lock(mutex_);
+  if (static_cast<size_t>(region) >= regions_.size()) regions_.resize(static_cast<size_t>(region) + 1);
+  RegionRecord& record = regions_[static_cast<size_t>(region)];
+  const uint64_t incarnation = record.status.incarnation;
+  record.status = {};
+  record.status.incarnation = incarnation;
+  record.status.member = false;
+  record.status.reported = std::chrono::steady_clock::now();
+  record.assigned = record.retired = false;
+  EncodeLayoutChange(layout, &record.joins.emplace());
+  Changed();
+}
+
+void ControlService::Dismiss(RegionId region, const std::string& reason) {
+  v1::ToRegion message;
+  message.mutable_stop()->set_reason(reason);
+  const std::lock_guard lock(mutex_);
+  RegionRecord& record = regions_[static_cast<size_t>(region)];
+  if (record.session != nullptr) record.session->Send(std::move(message));
+}
+
+void ControlService::Retire(RegionId region) {
+  v1::ToRegion message;
+  message.mutable_peer_left()->set_region(region);
+  const std::lock_guard lock(mutex_);
+  RegionRecord& gone = regions_[static_cast<size_t>(region)];
+  gone.retired = true;
+  gone.joins.reset();
+  gone.status.endpoint.clear();
+  gone.status.report.Clear();
+  gone.status.member = gone.status.ready = false;
+  for (RegionRecord& record : regions_) {
+    if (&record != &gone && record.assigned && record.session != nullptr) record.session->Send(message);
+  }
+  Changed();
+}
+
+void ControlService::ChangeLayout(RegionId to, uint64_t sequence, const LayoutChange& layout) {
+  v1::ToRegion message;
+  message.mutable_change_layout()->set_sequence(sequence);
+  EncodeLayoutChange(layout, message.mutable_change_layout()->mutable_layout());
+  const std::lock_guard lock(mutex_);
+  RegionRecord& record = regions_[static_cast<size_t>(to)];
+  if (record.session != nullptr && record.status.ready) record.session->Send(std::move(message));
+}
+
+std::optional<v1::LayoutOutcome> ControlService::TakeLayoutOutcome() {
+  const std::lock_guard lock(mutex_);
+  return std::exchange(layout_outcome_, std::nullopt);
+}
+
+void ControlService::SetLayout(const LayoutChange& layout) {
+  const std::lock_guard lock(mutex_);
+  layout_epoch_ = layout.epoch;
+  for (size_t i = 0; i < regions_.size(); ++i) {
+    regions_[i].status.member =
+        std::binary_search(layout.members.begin(), layout.members.end(), static_cast<RegionId>(i));
+  }
+  Changed();
 }
 
 }  // namespace aureole

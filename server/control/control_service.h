@@ -8,6 +8,7 @@
 #include <map>
 #include <memory>
 #include <mutex>
+#include <optional>
 #include <set>
 #include <string>
 #include <vector>
@@ -16,6 +17,7 @@
 
 #include "aureole/v1/control.grpc.pb.h"
 #include "server/control/run_status.h"
+#include "server/core/division.h"
 
 namespace aureole {
 
@@ -62,6 +64,19 @@ class ControlService final : public v1::Control::CallbackService {
   void Expect(RegionId region, uint64_t incarnation, const std::string& token);
   // Tells all servers to begin with tick 0 at this time, at Stage::kReady; else it does nothing.
   void StartAll(int64_t start_unix_us);
+  // The region joins with this layout: its servers are told so, and all members of them. The list of regions grows when
+  // it is new; else the name is free.
+  void Admit(RegionId region, const LayoutChange& layout);
+  // It will not join after all: its server is told to end.
+  void Dismiss(RegionId region, const std::string& reason);
+  // Its server has ended for good, and all others are told.
+  void Retire(RegionId region);
+  // Tells the server of this region, if there is one, to offer the change to the world.
+  void ChangeLayout(RegionId to, uint64_t sequence, const LayoutChange& layout);
+  // What became of a change, as the newest answer to ChangeLayout says, once.
+  std::optional<v1::LayoutOutcome> TakeLayoutOutcome();
+  // This layout is in force.
+  void SetLayout(const LayoutChange& layout);
   // Tells every server that is here to end.
   void Stop(const std::string& reason);
   // Ends all streams: the servers go on, and join again where they find a control plane. No new stream may come.
@@ -73,7 +88,9 @@ class ControlService final : public v1::Control::CallbackService {
     RegionStatus status;
     Session* session = nullptr;
     std::string token;
-    bool assigned = false;  // the server that is here
+    bool assigned = false;                  // the server that is here
+    bool retired = false;                   // there is none, and will be none
+    std::optional<v1::LayoutChange> joins;  // with which it joins, or has joined
     std::deque<v1::FrameTime> recent;
     std::deque<v1::Window> windows;
     Tick last_hash = -1;  // reported
@@ -93,6 +110,7 @@ class ControlService final : public v1::Control::CallbackService {
   v1::ToRegion Moved(RegionId region) const;
   void TellMoved(RegionId region);
   void CheckReady();
+  void CheckFinished();
   void Changed();
 
   const RunPlan plan_;
@@ -103,6 +121,8 @@ class ControlService final : public v1::Control::CallbackService {
   std::set<Session*> sessions_;  // alive
   Stage stage_ = Stage::kJoining;
   int64_t start_unix_us_ = 0;  // once running
+  uint64_t layout_epoch_ = kFirstLayoutEpoch;
+  std::optional<v1::LayoutOutcome> layout_outcome_;
   std::vector<RegionRecord> regions_;
   std::map<Tick, TickSum> hashes_;
   std::vector<v1::Violation> violations_;

@@ -22,6 +22,8 @@ void ReconcileRegion(RegionId region, const RegionObserved& r, bool recovers, st
   const auto act = [&](Action::Kind kind, uint64_t incarnation, std::string why) {
     out->push_back({kind, region, incarnation, std::move(why)});
   };
+  if (!r.wanted || (r.leaves && !r.alive && r.clean)) return;
+  if (r.joins) return act(Action::Kind::kStart, r.incarnation + 1, "the region joins the world");
   if (r.incarnation == 0) return act(Action::Kind::kStart, 1, "the world begins");
   const std::string lost = r.alive ? Lost(r, recovers) : r.how;
   if (lost.empty() || (!r.alive && r.clean && r.finished)) return;

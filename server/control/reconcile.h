@@ -22,6 +22,9 @@ struct RegionObserved {
   int failures = 0;          // servers in a row that ended without getting the region further than it was before
   std::string how;           // not alive: how it ended
   bool adopted = false;      // an earlier control plane started it: it knows where to join again
+  bool wanted = true;        // the region is to have a server
+  bool leaves = false;       // it ends by itself, with exit status 0, and then the region is to have none
+  bool joins = false;        // no server of the region was started since it was given its name
 };
 
 struct Observed {

@@ -14,6 +14,7 @@
 #include <absl/strings/str_split.h>
 
 #include "server/control/interrupts.h"
+#include "server/control/layout_run.h"
 #include "server/control/reconcile.h"
 #include "server/transport/world_spec.h"
 
@@ -86,6 +87,8 @@ class Runner {
     uint64_t incarnation = 0;
     bool alive = false;
     bool adopted = false;  // an earlier control plane has started it
+    bool joins = false;    // none was started since the region was given its name
+    bool wanted = true;
     Clock::time_point ended;
     Tick furthest = 0;            // that any server of it had reported when it ended
     int failures = 0;             // in a row, without getting further
@@ -149,6 +152,8 @@ class Runner {
     plan.hash_every = options_.hash_every;
     plan.checkpoint_every = options_.checkpoint_every;
     service_ = std::make_unique<ControlService>(plan);
+    layout_ = std::make_unique<LayoutRun>(*service_, options_.layouts, static_cast<int>(servers_.size()),
+                                          [this](RegionId r, const std::string& what) { Tell(r, what); });
     if (options_.hub != nullptr) {
       options_.hub->Add(options_.world_name, service_.get());
       address_ = options_.advertise;
@@ -187,6 +192,8 @@ class Runner {
         return absl::CancelledError("left; the servers go on");
       }
       TakeExits();
+      layout_->Step(service_->Status());
+      FollowLayout();
       const RunStatus status = service_->Status();
       TellOfStorage(status);
       if (absl::Status s = Keep(status); !s.ok()) return s;
@@ -210,6 +217,26 @@ class Runner {
     }
   }
 
+  // Servers of regions that have a new name, or one that was free.
+  void FollowLayout() {
+    const auto regions = static_cast<size_t>(layout_->regions());
+    for (size_t i = 0; i < regions; ++i) {
+      const bool wanted = layout_->WantsServer(static_cast<RegionId>(i));
+      if (i == servers_.size()) {
+        servers_.emplace_back();
+        record_.add_regions();
+        servers_[i].wanted = false;
+      }
+      if (wanted && !servers_[i].wanted) {
+        const uint64_t last = servers_[i].incarnation;
+        servers_[i] = {};
+        servers_[i].incarnation = last;
+        servers_[i].joins = true;
+      }
+      servers_[i].wanted = wanted;
+    }
+  }
+
   void TakeExits() {
     const std::vector<ServerExit> exits = allocator_.Poll();
     if (exits.empty()) return;
@@ -225,6 +252,7 @@ class Runner {
       const bool killed = absl::StartsWith(exit.how, "killed");
       server.port_lost = !killed && !status.regions[static_cast<size_t>(exit.region)].joined;
       server.exit = exit;
+      layout_->Ended(exit.region, exit.clean);
     }
   }
 
@@ -241,7 +269,8 @@ class Runner {
       const bool joins = server.adopted && !r.joined;
       out.regions.push_back({server.incarnation, server.alive, r.joined, r.joined && !r.left, r.finished,
                              server.exit.clean, talks || joins || r.left ? Seconds(now - r.reported) : 0,
-                             Seconds(now - server.ended), server.failures, server.exit.how, server.adopted});
+                             Seconds(now - server.ended), server.failures, server.exit.how, server.adopted,
+                             server.wanted, layout_->Leaves(static_cast<RegionId>(i)), server.joins});
     }
     return out;
   }
@@ -288,7 +317,7 @@ class Runner {
     if (absl::Status s = allocator_.Start({a.region, a.incarnation, token, address_, listen}); !s.ok()) return s;
     server.incarnation = a.incarnation;
     server.alive = true;
-    server.adopted = false;
+    server.adopted = server.joins = false;
     server.exit = {};
     return absl::OkStatus();
   }
@@ -363,6 +392,7 @@ class Runner {
   std::unique_ptr<Security> security_;
   std::unique_ptr<ControlService> service_;
   std::unique_ptr<grpc::Server> server_;  // ends before the service
+  std::unique_ptr<LayoutRun> layout_;
   std::string address_;
   v1::WorldRecord record_;
   std::vector<RunPlan::Region> plan_regions_;

@@ -13,6 +13,7 @@
 #include "server/control/allocator.h"
 #include "server/control/control_hub.h"
 #include "server/control/control_service.h"
+#include "server/control/layout_desk.h"
 #include "server/control/run_status.h"
 #include "server/control/world_store.h"
 #include "server/transport/security.h"
@@ -36,6 +37,8 @@ struct RunOptions {
   // Kept there, the run outlives this control plane: the one that calls RunWorld next with the same store and world
   // finds the servers that still run, replaces those that do not, and goes on. Outlives the run.
   WorldStore* store = nullptr;
+  // What operators want of the layout. Null: it stays as it is. Outlives the run.
+  LayoutDesk* layouts = nullptr;
   uint64_t control_epoch = 1;  // grows with each control plane of the world; servers obey no lower one
   // Once it is true, RunWorld returns and the servers go on without a control plane. Needs a store.
   const std::atomic<bool>* leave = nullptr;

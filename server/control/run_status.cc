@@ -17,8 +17,10 @@ constexpr std::chrono::milliseconds kSilence{1500};
 
 Tick RunStatus::MinTick() const {
   Tick least = std::numeric_limits<Tick>::max();
-  for (const RegionStatus& r : regions) least = std::min<Tick>(least, r.report.tick());
-  return regions.empty() ? 0 : least;
+  for (const RegionStatus& r : regions) {
+    if (r.member) least = std::min<Tick>(least, r.report.tick());
+  }
+  return least == std::numeric_limits<Tick>::max() ? 0 : least;
 }
 
 Tick RunStatus::MaxTick() const {
@@ -46,7 +48,7 @@ std::vector<std::string> RunStatus::Waiting() const {
     const RegionStatus& r = regions[i];
     if (stage == Stage::kJoining && !r.joined) out.push_back(absl::StrCat("region ", i, " has not joined"));
     if (stage == Stage::kLoading && !r.ready) out.push_back(absl::StrCat("region ", i, " loads the world"));
-    if (stage != Stage::kRunning || r.finished) continue;
+    if (stage != Stage::kRunning || r.finished || !r.member) continue;
     if (r.report.waiting_for_size() > 0) {
       out.push_back(absl::StrCat("region ", i, " waits for region ", absl::StrJoin(r.report.waiting_for(), ", ")));
     }

@@ -25,6 +25,7 @@ struct RegionStatus {
   bool joined = false, ready = false, finished = false;
   bool was_ready = false;  // this server or an earlier one: there is a checkpoint
   bool left = false;       // its stream has ended
+  bool member = true;      // by the layout in force, as far as is known; else it will join, or leaves, or has left
   std::string goodbye;     // the reason it gave, if any
   std::string endpoint, metrics_endpoint;
   int64_t pid = 0;
@@ -52,10 +53,11 @@ struct RunEvent {
 
 struct RunStatus {
   Stage stage = Stage::kJoining;
-  int64_t start_unix_us = 0;  // wall time of tick 0; 0: not known yet
-  std::vector<RegionStatus> regions;
+  int64_t start_unix_us = 0;          // wall time of tick 0; 0: not known yet
+  std::vector<RegionStatus> regions;  // the list only grows
   TickSum hash;  // the newest that every region has told its part of; of no regions when there is none
 
+  // Of the members.
   Tick MinTick() const;
   Tick MaxTick() const;
   int64_t Bodies() const;

@@ -89,6 +89,7 @@ absl::Status HostedRegion::LoadRegion(const std::filesystem::path& data) {
   links_ = std::make_unique<RegionLinks>(identity, region_->peers(), log, keep, std::move(link_states_));
   for (RegionId peer = 0; peer < assignment_.incarnations_size(); ++peer) {
     links_->Redirect(peer, "", assignment_.incarnations(peer));
+    if (assignment_.incarnations(peer) == 0) links_->Forget(peer);
   }
   if (!keep || recovered_) return absl::OkStatus();
   // What is here may be of another region that had this name. One that joins begins its journal when it has.

@@ -35,6 +35,7 @@ RegionLinks::RegionLinks(const LinkIdentity& identity, const std::vector<RegionI
   for (RegionId peer : peers) {
     if (!links_.contains(peer)) Make(peer, identity_.layout_epoch);
   }
+  for (auto& [peer, made] : links_) made.member = Contains(peers, peer);
 }
 
 RegionLinks::~RegionLinks() { Close(); }

@@ -93,6 +93,7 @@ bool TickLoop::Join() {
     if (Clock::now() - reported_at_ < kReportEvery) continue;
     missing_.clear();
     links_->Unmet(&missing_);
+    pending_.set_may_join(missing_.empty());
     Report(missing_, false);
   }
   if (stopped_) return false;
@@ -101,6 +102,10 @@ bool TickLoop::Join() {
   if (journal_ != nullptr) {
     // Before anybody hears of it, so the next incarnation joins again, or goes on from here.
     const absl::Status s = journal_->Begin(TakeCheckpoint(options_.world_hash, *region_, *links_));
+    if (absl::IsAborted(s)) {
+      hooks_.fenced();
+      return false;
+    }
     if (!s.ok()) hooks_.log(absl::StrCat("the first checkpoint: ", std::string(s.message())));
   }
   FollowLayout();
@@ -115,12 +120,12 @@ void TickLoop::Leave() {
   while (!stopped_) {
     const bool durable = journal_ == nullptr || journal_->stats().durable_tick >= region_->tick();
     if (journal_ != nullptr) TellDurable();
-    if (durable && links_->released()) break;
+    if (journal_ != nullptr && journal_->fenced()) return hooks_.fenced();
+    if (durable && links_->released()) return hooks_.gone();
     if (!durable) Checkpoint(0);
     Take(Clock::now() + kLookEvery);
     if (Clock::now() - reported_at_ >= kReportEvery) Report({}, false);
   }
-  if (!stopped_ && hooks_.gone) hooks_.gone();
 }
 
 // Links to those that come and from those that go.

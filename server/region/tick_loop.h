@@ -50,8 +50,7 @@ class TickLoop {
     std::function<void(const v1::Report&, bool heard)> epilogue;
     std::function<void(const std::string&)> log;  // waits over 1 s, violations, refused frames
     std::function<void()> fenced;                 // with a journal: a later incarnation has taken over; the loop ends
-    // The region has left its world, and nobody can need its frames any more. May be empty.
-    std::function<void()> gone = nullptr;
+    std::function<void()> gone;                   // the region has left, and nobody needs its frames; the loop ends
   };
 
   // All outlive the loop. `journal`: null for none.

@@ -256,7 +256,7 @@ class Servers {
         // An incarnation says again what the one before it has said.
         EXPECT_EQ(it->second, std::pair(h.hash(), h.bodies())) << "tick " << h.tick() << ", region " << r;
       }
-      node->met = report.layout_epoch() == 0 && report.waiting_for().empty();
+      node->met = report.may_join();
       node->left = report.left();
       node->epoch = report.layout_epoch();
       node->tick = report.tick();
@@ -267,6 +267,7 @@ class Servers {
       return true;
     };
     hooks.log = [](const std::string&) {};
+    hooks.fenced = [] {};
     hooks.gone = [this, node] {
       const std::lock_guard lock(mutex_);
       node->gone = true;

@@ -1,0 +1,52 @@
+#include "server/control/layout_desk.h"
+
+#include <utility>
+
+#include "server/control/layout_change.h"
+#include "server/core/partition.h"
+
+namespace aureole {
+
+LayoutDesk::LayoutDesk(const World& world) : fixed_(world.exchange.k != 0) { state_.now = FirstLayout(world); }
+
+absl::Status LayoutDesk::Want(const Make& make) {
+  if (fixed_) {
+    return absl::FailedPreconditionError(
+        "the layout of this world cannot change while it runs, because its exchange has a delay; use the synchronous "
+        "exchange");
+  }
+  const std::lock_guard lock(mutex_);
+  LayoutChange base = state_.now;
+  if (!state_.wanted.empty()) base.regions = state_.wanted;
+  while (base.ranks.size() < base.regions.size()) base.ranks.push_back(static_cast<int>(base.ranks.size()));
+  absl::StatusOr<std::vector<Rect>> wanted = make(base, state_);
+  if (!wanted.ok()) return wanted.status();
+  std::vector<int> ranks;
+  for (size_t i = 0; i < wanted->size(); ++i) ranks.push_back(static_cast<int>(i));
+  if (absl::Status s = Layout::WithRanks(*wanted, ranks).status(); !s.ok()) return s;
+  state_.wanted = *std::move(wanted);
+  state_.changing = true;
+  return absl::OkStatus();
+}
+
+LayoutDesk::State LayoutDesk::state() const {
+  const std::lock_guard lock(mutex_);
+  return state_;
+}
+
+std::vector<Rect> LayoutDesk::wanted() const {
+  const std::lock_guard lock(mutex_);
+  return state_.wanted;
+}
+
+// What is wanted may have become another meanwhile.
+void LayoutDesk::Publish(State state) {
+  const std::lock_guard lock(mutex_);
+  if (state.wanted != state_.wanted) {
+    state.wanted = state_.wanted;
+    state.changing = true;
+  }
+  state_ = std::move(state);
+}
+
+}  // namespace aureole

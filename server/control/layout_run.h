@@ -1,0 +1,66 @@
+// Carries out the changes of one run's layout, one step at each look at its servers (layout_change.h), and knows which
+// regions have a server.
+#pragma once
+
+#include <chrono>
+#include <functional>
+#include <optional>
+#include <set>
+#include <string>
+
+#include "server/control/control_service.h"
+#include "server/control/layout_change.h"
+#include "server/control/layout_desk.h"
+#include "server/control/run_status.h"
+
+namespace aureole {
+
+// One thread at a time.
+class LayoutRun {
+ public:
+  // All outlive it. `desk`: null: the layout stays as it is. `tell`: what happens, for people.
+  LayoutRun(ControlService& service, LayoutDesk* desk, int regions,
+            std::function<void(RegionId, const std::string&)> tell);
+
+  // At each look.
+  void Step(const RunStatus& status);
+  // The region's server has ended; `clean`: in order.
+  void Ended(RegionId region, bool clean);
+
+  // Of the list, which only grows.
+  int regions() const { return regions_; }
+  // Whether the region is to have a server: it is a member, will be, or its server has yet to leave in order.
+  bool WantsServer(RegionId region) const;
+  // Its server ends by itself, and gets no next one then.
+  bool Leaves(RegionId region) const { return leaving_.contains(region); }
+
+ private:
+  using Clock = std::chrono::steady_clock;
+  struct Offer {
+    RegionId to = kNoRegion;
+    uint64_t incarnation = 0;
+    Clock::time_point at;
+  };
+
+  LayoutObserved Observe(const RunStatus& status) const;
+  bool IsMember(RegionId region) const;
+  void Propose(const LayoutChange& change);
+  void Adopt();
+  void Drop();
+  void Publish() const;
+
+  ControlService& service_;
+  LayoutDesk* const desk_;
+  const std::function<void(RegionId, const std::string&)> tell_;
+  int regions_;
+  LayoutChange now_;
+  std::optional<LayoutChange> proposed_;
+  uint64_t sequence_ = 0;
+  std::optional<Offer> offer_;
+  std::optional<v1::LayoutOutcome> outcome_;
+  std::string refused_;
+  std::set<RegionId> leaving_;  // no members any more, and their servers have not ended
+  std::set<RegionId> ending_;   // were to join and will not; their servers have been told to end
+};
+
+}  // namespace aureole
