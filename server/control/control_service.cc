@@ -82,7 +82,10 @@ class ControlService::Session final : public grpc::ServerBidiReactor<v1::FromReg
 };
 
 ControlService::ControlService(RunPlan plan)
-    : plan_(std::move(plan)), world_hash_(WorldHash(plan_.world)), regions_(plan_.regions.size()) {
+    : plan_(std::move(plan)),
+      world_hash_(WorldHash(plan_.world)),
+      layout_epoch_(plan_.layout_epoch),
+      regions_(plan_.regions.size()) {
   for (size_t i = 0; i < regions_.size(); ++i) {
     const RunPlan::Region& from = plan_.regions[i];
     regions_[i].token = from.token;
@@ -90,6 +93,9 @@ ControlService::ControlService(RunPlan plan)
     status.incarnation = from.incarnation;
     status.was_ready = from.was_ready;
     status.endpoint = from.endpoint;
+    status.member = from.member;
+    regions_[i].joins = from.joins;
+    regions_[i].retired = from.retired;
     status.reported = std::chrono::steady_clock::now();
   }
   start_unix_us_ = plan_.start_unix_us;

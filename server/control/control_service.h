@@ -31,12 +31,16 @@ struct RunPlan {
     uint64_t incarnation = 1;  // of that server
     bool was_ready = false;    // some server of it was: there is a checkpoint
     std::string endpoint = {};
+    std::optional<v1::LayoutChange> joins = std::nullopt;  // with which it joins, or has joined
+    bool member = true;
+    bool retired = false;  // it has left: it has no server
   };
   v1::WorldSpec world;
   std::vector<Region> regions;
   uint64_t control_epoch = 1;  // grows with each control plane that takes over
-  int64_t start_unix_us = 0;   // of a world that an earlier control plane has started
-  bool undivided = false;      // one region, whatever the layout says
+  uint64_t layout_epoch = kFirstLayoutEpoch;
+  int64_t start_unix_us = 0;  // of a world that an earlier control plane has started
+  bool undivided = false;     // one region, whatever the layout says
   bool no_real_time = false;
   Tick checkpoint_every = 0;  // ticks; 0: none, and no region can be replaced
   Tick last_tick = 0;         // 0: no end
@@ -121,7 +125,7 @@ class ControlService final : public v1::Control::CallbackService {
   std::set<Session*> sessions_;  // alive
   Stage stage_ = Stage::kJoining;
   int64_t start_unix_us_ = 0;  // once running
-  uint64_t layout_epoch_ = kFirstLayoutEpoch;
+  uint64_t layout_epoch_;
   std::optional<v1::LayoutOutcome> layout_outcome_;
   std::vector<RegionRecord> regions_;
   std::map<Tick, TickSum> hashes_;

@@ -3,7 +3,11 @@
 #include <algorithm>
 #include <utility>
 
+#include <google/protobuf/util/message_differencer.h>
+
 #include <absl/strings/str_cat.h>
+
+#include "server/transport/input_codec.h"
 
 namespace aureole {
 namespace {
@@ -23,13 +27,61 @@ uint64_t NextSequence(uint64_t last) {
 
 }  // namespace
 
-LayoutRun::LayoutRun(ControlService& service, LayoutDesk* desk, int regions,
-                     std::function<void(RegionId, const std::string&)> tell)
-    : service_(service), desk_(desk), tell_(std::move(tell)), regions_(regions) {
+LayoutRun::LayoutRun(LayoutDesk* desk, int regions, std::function<void(RegionId, const std::string&)> tell)
+    : desk_(desk), tell_(std::move(tell)), regions_(regions) {
   if (desk_ != nullptr) now_ = desk_->state().now;
 }
 
-bool LayoutRun::IsMember(RegionId region) const { return desk_ == nullptr || Contains(now_.members, region); }
+absl::Status LayoutRun::Restore(const v1::WorldRecord& record) {
+  regions_ = std::max(regions_, record.regions_size());
+  if (!record.has_layout()) return absl::OkStatus();
+  LayoutChange now, proposed, wanted;
+  for (const auto& [from, to] : {std::pair(&record.layout(), &now), std::pair(&record.proposed(), &proposed),
+                                 std::pair(&record.wanted(), &wanted)}) {
+    if (absl::Status s = DecodeLayoutChange(*from, to); !s.ok()) return absl::FailedPreconditionError(s.message());
+  }
+  now_ = std::move(now);
+  if (record.has_proposed()) proposed_ = std::move(proposed);
+  sequence_ = record.layout_sequence();
+  leaving_ = {record.leaving().begin(), record.leaving().end()};
+  for (int i = 0; i < record.regions_size(); ++i) {
+    if (record.regions(i).has_joins()) joins_[i] = record.regions(i).joins();
+  }
+  if (desk_ == nullptr) return absl::OkStatus();
+  Publish();
+  if (wanted.regions.empty()) return absl::OkStatus();
+  return desk_->Want([&](const LayoutChange&, const LayoutDesk::State&) { return wanted.regions; });
+}
+
+bool LayoutRun::Keep(v1::WorldRecord* record) {
+  if (now_.epoch == 0) return false;
+  v1::WorldRecord next;
+  EncodeLayoutChange(now_, next.mutable_layout());
+  if (proposed_.has_value()) EncodeLayoutChange(*proposed_, next.mutable_proposed());
+  next.set_layout_sequence(sequence_);
+  LayoutChange wanted;
+  if (desk_ != nullptr) wanted.regions = desk_->wanted();
+  if (!wanted.regions.empty()) EncodeLayoutChange(wanted, next.mutable_wanted());
+  for (RegionId r : leaving_) next.add_leaving(r);
+  for (const auto& [r, joins] : joins_) *record->mutable_regions(r)->mutable_joins() = joins;
+  v1::WorldRecord last;
+  if (record->has_layout()) *last.mutable_layout() = record->layout();
+  if (record->has_proposed()) *last.mutable_proposed() = record->proposed();
+  last.set_layout_sequence(record->layout_sequence());
+  if (record->has_wanted()) *last.mutable_wanted() = record->wanted();
+  *last.mutable_leaving() = record->leaving();
+  if (google::protobuf::util::MessageDifferencer::Equals(last, next)) return false;
+  record->clear_proposed();
+  record->clear_wanted();
+  record->clear_leaving();
+  record->MergeFrom(next);
+  *record->mutable_layout() = next.layout();
+  if (next.has_proposed()) *record->mutable_proposed() = next.proposed();
+  return true;
+}
+
+// Without a desk, and nothing kept, the layout is the world's for ever.
+bool LayoutRun::IsMember(RegionId region) const { return now_.epoch == 0 || Contains(now_.members, region); }
 
 bool LayoutRun::WantsServer(RegionId region) const {
   const bool joins = proposed_.has_value() && Contains(proposed_->members, region);
@@ -39,7 +91,7 @@ bool LayoutRun::WantsServer(RegionId region) const {
 LayoutObserved LayoutRun::Observe(const RunStatus& status) const {
   LayoutObserved out;
   out.now = now_;
-  out.wanted = desk_->wanted();
+  if (desk_ != nullptr) out.wanted = desk_->wanted();
   out.proposed = proposed_;
   for (size_t i = 0; i < status.regions.size(); ++i) {
     const auto r = static_cast<RegionId>(i);
@@ -58,8 +110,8 @@ LayoutObserved LayoutRun::Observe(const RunStatus& status) const {
 }
 
 void LayoutRun::Step(const RunStatus& status) {
-  if (desk_ == nullptr || status.stage != Stage::kRunning) return;
-  if (std::optional<v1::LayoutOutcome> outcome = service_.TakeLayoutOutcome();
+  if (now_.epoch == 0 || status.stage != Stage::kRunning) return;
+  if (std::optional<v1::LayoutOutcome> outcome = service_->TakeLayoutOutcome();
       outcome.has_value() && outcome->sequence() == sequence_) {
     outcome_ = std::move(outcome);
   }
@@ -71,7 +123,7 @@ void LayoutRun::Step(const RunStatus& status) {
       Propose(step.change);
       break;
     case LayoutStep::Kind::kOffer:
-      service_.ChangeLayout(step.to, sequence_, *proposed_);
+      service_->ChangeLayout(step.to, sequence_, *proposed_);
       offer_ = {step.to, status.regions[static_cast<size_t>(step.to)].incarnation, Clock::now()};
       break;
     case LayoutStep::Kind::kAdopt:
@@ -81,7 +133,7 @@ void LayoutRun::Step(const RunStatus& status) {
       Drop();
       break;
   }
-  Publish();
+  if (desk_ != nullptr) Publish();
 }
 
 void LayoutRun::Propose(const LayoutChange& change) {
@@ -92,7 +144,8 @@ void LayoutRun::Propose(const LayoutChange& change) {
   for (RegionId r : change.members) {
     if (Contains(now_.members, r)) continue;
     regions_ = std::max(regions_, r + 1);
-    service_.Admit(r, change);
+    EncodeLayoutChange(change, &(joins_[r] = {}));
+    service_->Admit(r, change);
     tell_(r, absl::StrCat("joins with the layout of epoch ", change.epoch));
   }
 }
@@ -105,7 +158,7 @@ void LayoutRun::Adopt() {
   }
   now_ = *std::exchange(proposed_, std::nullopt);
   refused_.clear();
-  service_.SetLayout(now_);
+  service_->SetLayout(now_);
   tell_(kNoRegion,
         absl::StrCat("the layout of epoch ", now_.epoch, " is in force, of ", now_.members.size(), " regions"));
 }
@@ -118,14 +171,14 @@ void LayoutRun::Drop() {
   for (RegionId r : proposed_->members) {
     if (Contains(now_.members, r)) continue;
     ending_.insert(r);
-    service_.Dismiss(r, refused_);
+    service_->Dismiss(r, refused_);
   }
   proposed_.reset();
 }
 
 void LayoutRun::Ended(RegionId region, bool clean) {
   if (ending_.erase(region) == 0 && (!clean || leaving_.erase(region) == 0)) return;
-  service_.Retire(region);
+  service_->Retire(region);
   tell_(region, "has left");
 }
 

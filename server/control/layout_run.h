@@ -4,10 +4,14 @@
 
 #include <chrono>
 #include <functional>
+#include <map>
 #include <optional>
 #include <set>
 #include <string>
 
+#include <absl/status/status.h>
+
+#include "aureole/v1/world_record.pb.h"
 #include "server/control/control_service.h"
 #include "server/control/layout_change.h"
 #include "server/control/layout_desk.h"
@@ -19,8 +23,14 @@ namespace aureole {
 class LayoutRun {
  public:
   // All outlive it. `desk`: null: the layout stays as it is. `tell`: what happens, for people.
-  LayoutRun(ControlService& service, LayoutDesk* desk, int regions,
-            std::function<void(RegionId, const std::string&)> tell);
+  LayoutRun(LayoutDesk* desk, int regions, std::function<void(RegionId, const std::string&)> tell);
+
+  // What an earlier control plane has kept, before anything else. FailedPrecondition: it is no layout.
+  absl::Status Restore(const v1::WorldRecord& record);
+  // From here on servers join there.
+  void Serve(ControlService* service) { service_ = service; }
+  // Writes what the next control plane must know; true when that has changed since the last call.
+  bool Keep(v1::WorldRecord* record);
 
   // At each look.
   void Step(const RunStatus& status);
@@ -31,6 +41,9 @@ class LayoutRun {
   int regions() const { return regions_; }
   // Whether the region is to have a server: it is a member, will be, or its server has yet to leave in order.
   bool WantsServer(RegionId region) const;
+  bool IsMember(RegionId region) const;
+  // Of the layout in force, as far as is known.
+  uint64_t epoch() const { return now_.epoch == 0 ? kFirstLayoutEpoch : now_.epoch; }
   // Its server ends by itself, and gets no next one then.
   bool Leaves(RegionId region) const { return leaving_.contains(region); }
 
@@ -43,13 +56,12 @@ class LayoutRun {
   };
 
   LayoutObserved Observe(const RunStatus& status) const;
-  bool IsMember(RegionId region) const;
   void Propose(const LayoutChange& change);
   void Adopt();
   void Drop();
   void Publish() const;
 
-  ControlService& service_;
+  ControlService* service_ = nullptr;
   LayoutDesk* const desk_;
   const std::function<void(RegionId, const std::string&)> tell_;
   int regions_;
@@ -59,6 +71,7 @@ class LayoutRun {
   std::optional<Offer> offer_;
   std::optional<v1::LayoutOutcome> outcome_;
   std::string refused_;
+  std::map<RegionId, v1::LayoutChange> joins_;
   std::set<RegionId> leaving_;  // no members any more, and their servers have not ended
   std::set<RegionId> ending_;   // were to join and will not; their servers have been told to end
 };

@@ -104,6 +104,8 @@ class Runner {
     plan_regions_.resize(servers_.size());
     const auto now = Clock::now();
     for (Server& server : servers_) server.ended = now;
+    layout_ = std::make_unique<LayoutRun>(options_.layouts, regions,
+                                          [this](RegionId r, const std::string& what) { Tell(r, what); });
     record_.set_world_hash(WorldHash(options_.world));
     for (int i = 0; i < regions; ++i) record_.add_regions();
     if (options_.store == nullptr) return absl::OkStatus();
@@ -111,12 +113,17 @@ class Runner {
     absl::StatusOr<std::optional<v1::WorldRecord>> found = options_.store->Load();
     if (!found.ok()) return found.status();
     if (found->has_value()) {
-      if ((*found)->world_hash() != record_.world_hash() || (*found)->regions_size() != regions) {
+      if ((*found)->world_hash() != record_.world_hash() || (*found)->regions_size() < regions) {
         return absl::FailedPreconditionError(
             "the store has another world, which may still run; take another store, or the world that it was made for");
       }
       record_ = **std::move(found);
     }
+    if (absl::Status s = layout_->Restore(record_); !s.ok()) return s;
+    const auto known = static_cast<size_t>(record_.regions_size());
+    servers_.resize(known);
+    plan_regions_.resize(known);
+    for (Server& server : servers_) server.ended = now;
     absl::StatusOr<std::vector<ServerStart>> adopted = allocator_.Adopt();
     if (!adopted.ok()) return adopted.status();
     leaves_ = false;
@@ -127,10 +134,16 @@ class Runner {
       plan_regions_[i].incarnation = std::max<uint64_t>(1, from.incarnation());
       plan_regions_[i].was_ready = from.was_ready();
       plan_regions_[i].endpoint = from.endpoint();
+      const auto r = static_cast<RegionId>(i);
+      servers_[i].wanted = layout_->WantsServer(r);
+      plan_regions_[i].member = layout_->IsMember(r);
+      plan_regions_[i].retired = !servers_[i].wanted;
+      if (from.has_joins()) plan_regions_[i].joins = from.joins();
     }
     for (const ServerStart& server : *adopted) {
       const auto i = static_cast<size_t>(server.region);
-      if (server.region < 0 || server.region >= regions || server.incarnation != servers_[i].incarnation) {
+      if (server.region < 0 || i >= servers_.size() || !servers_[i].wanted ||
+          server.incarnation != servers_[i].incarnation) {
         allocator_.End(server.region, server.incarnation);
         continue;
       }
@@ -145,6 +158,7 @@ class Runner {
     plan.world = options_.world;
     plan.regions = plan_regions_;
     plan.control_epoch = options_.control_epoch;
+    plan.layout_epoch = layout_->epoch();
     plan.start_unix_us = record_.start_unix_us();
     plan.undivided = options_.undivided;
     plan.no_real_time = options_.no_real_time;
@@ -152,8 +166,7 @@ class Runner {
     plan.hash_every = options_.hash_every;
     plan.checkpoint_every = options_.checkpoint_every;
     service_ = std::make_unique<ControlService>(plan);
-    layout_ = std::make_unique<LayoutRun>(*service_, options_.layouts, static_cast<int>(servers_.size()),
-                                          [this](RegionId r, const std::string& what) { Tell(r, what); });
+    layout_->Serve(service_.get());
     if (options_.hub != nullptr) {
       options_.hub->Add(options_.world_name, service_.get());
       address_ = options_.advertise;
@@ -324,7 +337,7 @@ class Runner {
 
   // What the next control plane must know, before anything depends on it.
   absl::Status Keep(const RunStatus& status) {
-    bool changed = false;
+    bool changed = layout_->Keep(&record_);
     for (size_t i = 0; i < servers_.size(); ++i) {
       v1::RegionRecord* const to = record_.mutable_regions(static_cast<int>(i));
       const RegionStatus& from = status.regions[i];
