@@ -10,6 +10,7 @@
 #include "client/cli/exit_codes.h"
 #include "client/cli/experiment.h"
 #include "client/cli/load.h"
+#include "client/cli/operate.h"
 #include "client/cli/record.h"
 #include "client/cli/replay.h"
 #include "client/cli/report.h"
@@ -52,6 +53,7 @@ int main(int argc, char** argv) {
   aureole::CompletionOptions completion_options;
   aureole::CertificatesOptions certificates_options;
   aureole::TokenOptions token_options;
+  aureole::OperateOptions operate_options;
   const CLI::App* up = aureole::AddUp(app, &up_options);
   const CLI::App* experiment = aureole::AddExperiment(app, &experiment_options);
   const CLI::App* watch = aureole::AddWatch(app, &watch_options);
@@ -67,6 +69,9 @@ int main(int argc, char** argv) {
   const CLI::App* doctor = aureole::AddDoctor(app, &doctor_options);
   const CLI::App* certificates = aureole::AddCertificates(app, &certificates_options);
   const CLI::App* token = aureole::AddToken(app, &token_options);
+  const CLI::App* world = aureole::AddWorld(app, &operate_options);
+  const CLI::App* resize = aureole::AddResize(app, &operate_options);
+  const CLI::App* drain = aureole::AddDrain(app, &operate_options);
   const CLI::App* completion = aureole::AddCompletion(app, &completion_options);
   aureole::AddCheck(app, &check_options);
   try {
@@ -86,6 +91,9 @@ int main(int argc, char** argv) {
   if (completion->parsed()) return aureole::RunCompletion(app, completion_options);
   if (certificates->parsed()) return aureole::RunCertificates(certificates_options);
   if (token->parsed()) return aureole::RunToken(token_options);
+  if (world->parsed()) return aureole::RunWorldCommand(operate_options);
+  if (resize->parsed()) return aureole::RunResize(operate_options);
+  if (drain->parsed()) return aureole::RunDrain(operate_options);
   if (record->parsed()) return aureole::RunRecord(record_options);
   if (replay->parsed()) return aureole::RunReplay(replay_options);
   if (report->parsed()) return aureole::RunReport(report_options);

@@ -51,7 +51,7 @@ class Display {
     } else {
       if (!viewer_says_.empty()) std::printf("%s\n", std::exchange(viewer_says_, "").c_str());
       if (status.stage >= Stage::kRunning && !std::exchange(named_, true)) {
-        std::printf("%s\n", ServersLine(status).c_str());
+        std::printf("%s\ncontrol plane %s\n", ServersLine(status).c_str(), status.control.c_str());
       }
       std::printf("%s\n", PlainLine(heading_, status).c_str());
     }
@@ -175,6 +175,10 @@ CLI::App* AddUp(CLI::App& app, UpOptions* o) {
       ->type_name("TICKS");
   up->add_flag("--json", o->json, "Print one JSON object at the end and nothing else");
   up->add_flag("--verbose", o->verbose, "Repeat the servers' logs on stderr");
+  up->add_option("--control", o->control,
+                 "Where the control plane listens, for aureole world, resize and drain; port 0 is any")
+      ->type_name("HOST:PORT")
+      ->capture_default_str();
   up->add_option("--logs", o->logs, "Keep the servers' logs in this directory")->type_name("DIR");
   up->add_option("--data", o->data, "Keep the regions' checkpoints in this directory; beside the logs when not given")
       ->type_name("DIR");
@@ -218,6 +222,9 @@ int Up(const UpOptions& options) {
   RunOptions run;
   run.world = file->spec;
   run.regions = file->world.layout.size();
+  run.listen = options.control;
+  LayoutDesk layouts(file->world);
+  if (!options.undivided) run.layouts = &layouts;
   run.undivided = options.undivided;
   run.no_real_time = options.no_real_time;
   run.last_tick = heading.last_tick;

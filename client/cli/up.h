@@ -14,7 +14,8 @@ struct UpOptions {
   bool json = false;
   bool undivided = false;
   bool verbose = false;
-  int64_t hash_every = -1;  // ticks; -1: 100 when there is a duration, else none
+  int64_t hash_every = -1;              // ticks; -1: 100 when there is a duration, else none
+  std::string control = "127.0.0.1:0";  // where servers and operators reach the control plane
   std::string logs, data, region_server;
   double checkpoint_s = 1;  // 0: none
   std::string tls, tokens;  // as aureole-region --help has them; empty: none

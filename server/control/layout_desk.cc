@@ -3,14 +3,27 @@
 #include <utility>
 
 #include "server/control/layout_change.h"
+#include "server/control/layout_plan.h"
 #include "server/core/partition.h"
 
 namespace aureole {
 
-LayoutDesk::LayoutDesk(const World& world) : fixed_(world.exchange.k != 0) { state_.now = FirstLayout(world); }
+LayoutDesk::LayoutDesk(const World& world) : world_(world) { state_.now = FirstLayout(world); }
+
+absl::Status LayoutDesk::Resize(int columns, int rows) {
+  return Want([&](const LayoutChange& now, const State& state) -> absl::StatusOr<std::vector<Rect>> {
+    absl::StatusOr<std::vector<Rect>> cells = EqualCells(world_, columns, rows);
+    if (!cells.ok()) return cells;
+    return AssignCells(now, *cells, state.leaving);
+  });
+}
+
+absl::Status LayoutDesk::Drain(RegionId region) {
+  return Want([&](const LayoutChange& now, const State&) { return WithoutArea(now, region); });
+}
 
 absl::Status LayoutDesk::Want(const Make& make) {
-  if (fixed_) {
+  if (world_.exchange.k != 0) {
     return absl::FailedPreconditionError(
         "the layout of this world cannot change while it runs, because its exchange has a delay; use the synchronous "
         "exchange");

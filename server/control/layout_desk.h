@@ -26,8 +26,15 @@ class LayoutDesk {
     std::string refused;    // why the newest change that came to nothing did so; it is tried again
   };
 
-  // Of a world that begins.
+  // Of a world that begins, which outlives this.
   explicit LayoutDesk(const World& world);
+  const World& world() const { return world_; }
+
+  // Cells of equal size (EqualCells), and as little as possible changes hands (AssignCells). InvalidArgument names the
+  // field; FailedPrecondition: the layout of this world cannot change.
+  absl::Status Resize(int columns, int rows);
+  // A neighbour gets the region's area (WithoutArea), and its server leaves.
+  absl::Status Drain(RegionId region);
 
   // What is wanted from here on; a change that is under way still comes into force before. `make` gets what is in force
   // or, when something else is wanted already, that. FailedPrecondition: the layout of this world cannot change; else
@@ -41,7 +48,7 @@ class LayoutDesk {
   void Publish(State state);
 
  private:
-  const bool fixed_;
+  const World& world_;
   mutable std::mutex mutex_;
   State state_;
 };

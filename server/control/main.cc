@@ -86,6 +86,8 @@ int main(int argc, char** argv) {
     return kBadInput;
   }
   options.world = file->spec;
+  aureole::LayoutDesk layouts(file->world);
+  options.layouts = &layouts;
   options.regions = file->world.layout.size();
   const int64_t tick_us = file->world.environment.tick_us;
   if (!duration.empty()) options.last_tick = aureole::TicksIn(absl::ToDoubleSeconds(length), tick_us);

@@ -13,6 +13,7 @@
 #include <absl/strings/str_join.h>
 #include <absl/strings/str_split.h>
 
+#include "server/control/control_plane_service.h"
 #include "server/control/interrupts.h"
 #include "server/control/layout_run.h"
 #include "server/control/reconcile.h"
@@ -186,6 +187,12 @@ class Runner {
     const std::string listen = any ? record_.control() : options_.listen;
     security_->Listen(&builder, listen, &port);
     security_->guard().Register(&builder, v1::Control::service_full_name(), service_.get());
+    if (options_.layouts != nullptr) {
+      operators_ = std::make_unique<ControlPlaneService>(*options_.layouts,
+                                                         [service = service_.get()] { return service->Status(); });
+      security_->guard().Register(&builder, v1::ControlPlane::service_full_name(), operators_.get());
+      security_->guard().ServeWorld(options_.layouts->world().name);
+    }
     server_ = builder.BuildAndStart();
     if (server_ == nullptr || port == 0) {
       leaves_ = options_.store != nullptr;
@@ -207,7 +214,8 @@ class Runner {
       TakeExits();
       layout_->Step(service_->Status());
       FollowLayout();
-      const RunStatus status = service_->Status();
+      RunStatus status = service_->Status();
+      status.control = address_;
       TellOfStorage(status);
       if (absl::Status s = Keep(status); !s.ok()) return s;
       if (absl::Status s = Act(status); !s.ok()) return s;
@@ -404,7 +412,8 @@ class Runner {
   const EventObserver& on_event_;
   std::unique_ptr<Security> security_;
   std::unique_ptr<ControlService> service_;
-  std::unique_ptr<grpc::Server> server_;  // ends before the service
+  std::unique_ptr<ControlPlaneService> operators_;
+  std::unique_ptr<grpc::Server> server_;  // ends before the services
   std::unique_ptr<LayoutRun> layout_;
   std::string address_;
   v1::WorldRecord record_;

@@ -53,6 +53,7 @@ struct RunEvent {
 
 struct RunStatus {
   Stage stage = Stage::kJoining;
+  std::string control;                // where servers and operators reach the control plane, host:port
   int64_t start_unix_us = 0;          // wall time of tick 0; 0: not known yet
   std::vector<RegionStatus> regions;  // the list only grows
   TickSum hash;  // the newest that every region has told its part of; of no regions when there is none

@@ -156,6 +156,9 @@ const std::map<std::string, Access>& MethodAccess() {
       {"aureole.v1.Simulation.SpawnBodies", kSpawn},
       {"aureole.v1.Simulation.RemoveBodies", kSpawn},
       {"aureole.v1.Recording.Record", kOperate},
+      {"aureole.v1.ControlPlane.GetWorld", kWatch},
+      {"aureole.v1.ControlPlane.ResizeLayout", kOperate},
+      {"aureole.v1.ControlPlane.DrainRegion", kOperate},
   };
   return table;
 }

@@ -3,13 +3,15 @@
 #include <gtest/gtest.h>
 #include <unistd.h>
 
+#include <grpcpp/grpcpp.h>
+
 #include <atomic>
 #include <cstdlib>
 #include <filesystem>
 #include <map>
 
+#include "aureole/v1/control_plane.grpc.pb.h"
 #include "server/control/layout_desk.h"
-#include "server/control/layout_plan.h"
 #include "server/control/local_allocator.h"
 #include "server/control/run.h"
 #include "server/control/sqlite_store.h"
@@ -44,17 +46,8 @@ class LayoutRunTest : public testing::Test {
   }
   ~LayoutRunTest() override { fs::remove_all(directory_); }
 
-  absl::Status Resize(int columns, int rows = 1) {
-    return desk_->Want(
-        [&](const LayoutChange& now, const LayoutDesk::State& state) -> absl::StatusOr<std::vector<Rect>> {
-          absl::StatusOr<std::vector<Rect>> cells = EqualCells(*world_, columns, rows);
-          if (!cells.ok()) return cells;
-          return AssignCells(now, *cells, state.leaving);
-        });
-  }
-  absl::Status Drain(RegionId region) {
-    return desk_->Want([&](const LayoutChange& now, const LayoutDesk::State&) { return WithoutArea(now, region); });
-  }
+  absl::Status Resize(int columns, int rows = 1) { return desk_->Resize(columns, rows); }
+  absl::Status Drain(RegionId region) { return desk_->Drain(region); }
 
   // Takes the steps, each as soon as the one before is done and some ticks have passed; then runs on for a while.
   void Run(const std::vector<std::function<void()>>& steps, const RunObserver& look = nullptr) {
@@ -190,6 +183,60 @@ TEST_F(LayoutRunTest, TheNextControlPlaneFinishesWhatTheLastOneHasBegun) {
   options_ = options;
   ASSERT_FALSE(result_.hashes.empty());
   ExpectExact(result_.status.MinTick() - 20);
+}
+
+TEST_F(LayoutRunTest, OperatorsResizeAndDrainByCalls) {
+  std::string control;
+  const auto call = [&](auto method, const auto& request, auto* response) {
+    const auto stub = v1::ControlPlane::NewStub(grpc::CreateChannel(control, grpc::InsecureChannelCredentials()));
+    grpc::ClientContext context;
+    context.set_deadline(std::chrono::system_clock::now() + std::chrono::seconds(10));
+    return ((*stub).*method)(&context, request, response);
+  };
+  using Stub = v1::ControlPlane::Stub;
+  const auto resize = [&](int columns) {
+    v1::ResizeLayoutRequest request;
+    request.set_columns(columns);
+    v1::ResizeLayoutResponse response;
+    return call(&Stub::ResizeLayout, request, &response);
+  };
+  const auto drain = [&](RegionId region) {
+    v1::DrainRegionRequest request;
+    request.set_region(region);
+    v1::DrainRegionResponse response;
+    return call(&Stub::DrainRegion, request, &response);
+  };
+  const auto world = [&] {
+    v1::ControlledWorld out;
+    const grpc::Status s = call(&Stub::GetWorld, v1::GetControlledWorldRequest(), &out);
+    EXPECT_TRUE(s.ok()) << s.error_message();
+    return out;
+  };
+  Run({[&] {
+         EXPECT_EQ(resize(0).error_code(), grpc::StatusCode::INVALID_ARGUMENT);
+         EXPECT_EQ(drain(7).error_code(), grpc::StatusCode::INVALID_ARGUMENT);
+         EXPECT_EQ(world().layout_epoch(), 1u);
+         EXPECT_TRUE(resize(3).ok());
+         EXPECT_TRUE(world().changing());
+       },
+       [&] {
+         EXPECT_EQ(world().regions_size(), 3);
+         EXPECT_TRUE(drain(1).ok());
+       },
+       [&] {
+         const v1::ControlledWorld now = world();
+         EXPECT_EQ(now.name(), world_->name);
+         EXPECT_EQ(now.regions_size(), 3);
+         EXPECT_FALSE(now.regions(1).member());
+         EXPECT_EQ(now.regions(1).endpoint(), "");
+         EXPECT_GT(now.regions(0).tick(), 0);
+         EXPECT_FALSE(now.changing());
+       }},
+      [&](const RunStatus& status) {
+        control = status.control;
+        return true;
+      });
+  ExpectExact();
 }
 
 }  // namespace

@@ -1,0 +1,160 @@
+#include "client/cli/operate.h"
+
+#include <chrono>
+#include <iostream>
+#include <memory>
+#include <thread>
+
+#include <absl/strings/str_format.h>
+#include <google/protobuf/util/json_util.h>
+#include <grpcpp/grpcpp.h>
+
+#include "aureole/v1/control_plane.grpc.pb.h"
+#include "client/cli/connect.h"
+#include "client/cli/exit_codes.h"
+#include "client/src/channel.h"
+
+namespace aureole {
+namespace {
+
+constexpr std::chrono::seconds kPatience{10};
+constexpr std::chrono::milliseconds kLookEvery{200};
+
+using Stub = v1::ControlPlane::StubInterface;
+
+std::unique_ptr<Stub> Reach(const OperateOptions& o) {
+  return v1::ControlPlane::NewStub(client::ChannelTo(o.control, GivenAccess()));
+}
+
+// kExitOk, or what went wrong after a message on stderr.
+int Say(const grpc::Status& s) {
+  if (s.ok()) return kExitOk;
+  std::cerr << s.error_message() << '\n';
+  const bool wrong =
+      s.error_code() == grpc::StatusCode::INVALID_ARGUMENT || s.error_code() == grpc::StatusCode::FAILED_PRECONDITION;
+  return wrong ? kExitBadInput : kExitFailed;
+}
+
+template <class Request, class Response>
+int Call(Stub* stub, grpc::Status (Stub::*method)(grpc::ClientContext*, const Request&, Response*),
+         const Request& request, Response* response) {
+  grpc::ClientContext context;
+  context.set_deadline(std::chrono::system_clock::now() + kPatience);
+  return Say((stub->*method)(&context, request, response));
+}
+
+void Print(const v1::ControlledWorld& world, bool json) {
+  if (json) {
+    std::string text;
+    google::protobuf::util::JsonPrintOptions options;
+    options.always_print_primitive_fields = true;
+    options.preserve_proto_field_names = true;
+    if (google::protobuf::util::MessageToJsonString(world, &text, options).ok()) std::cout << text << std::endl;
+    return;
+  }
+  std::cout << "world " << world.name() << ", layout epoch " << world.layout_epoch()
+            << (world.changing() ? ", changing" : "") << '\n';
+  if (!world.refused().empty()) std::cout << "refused: " << world.refused() << '\n';
+  std::cout << absl::StrFormat("%6s %-8s %9s %9s %9s %9s %9s %9s  %s\n", "region", "", "min x", "max x", "min z",
+                               "max z", "bodies", "tick", "server");
+  for (int i = 0; i < world.regions_size(); ++i) {
+    const v1::ControlledRegion& r = world.regions(i);
+    const bool left = !r.member() && r.endpoint().empty();
+    std::cout << absl::StrFormat("%6d %-8s %9.4g %9.4g %9.4g %9.4g %9d %9d  %s\n", i,
+                                 left         ? "left"
+                                 : r.member() ? "member"
+                                              : "-",
+                                 r.min_x(), r.max_x(), r.min_z(), r.max_z(), r.bodies(), r.tick(), r.endpoint());
+  }
+  std::cout.flush();
+}
+
+// Until the layout is the wanted one, or the time is over.
+int Await(Stub* stub, const OperateOptions& o) {
+  const auto until = std::chrono::steady_clock::now() + std::chrono::duration<double>(o.wait_s);
+  for (;;) {
+    v1::ControlledWorld world;
+    if (const int code = Call(stub, &Stub::GetWorld, v1::GetControlledWorldRequest(), &world); code != kExitOk) {
+      return code;
+    }
+    const bool over = std::chrono::steady_clock::now() >= until;
+    if (!world.changing() || over) {
+      Print(world, o.json);
+      if (world.changing() && o.wait_s > 0) std::cerr << "not done after " << o.wait_s << " s; it goes on\n";
+      return world.changing() && o.wait_s > 0 ? kExitFailed : kExitOk;
+    }
+    std::this_thread::sleep_for(kLookEvery);
+  }
+}
+
+void AddControl(CLI::App* c, OperateOptions* o) {
+  c->add_option("--control", o->control,
+                "The world's control plane: --listen of aureole-control, --control of aureole up")
+      ->required()
+      ->type_name("HOST:PORT");
+  c->add_flag("--json", o->json, "One JSON object");
+  AddAccess(c);
+}
+
+void AddWait(CLI::App* c, OperateOptions* o) {
+  c->add_option("--wait", o->wait_s, "Seconds to wait until it is done; 0: not at all")
+      ->check(CLI::Range(0.0, 86400.0))
+      ->capture_default_str();
+}
+
+}  // namespace
+
+CLI::App* AddWorld(CLI::App& app, OperateOptions* o) {
+  CLI::App* c = app.add_subcommand("world", "How a running world is divided, and how its servers do");
+  AddControl(c, o);
+  c->footer(std::string("Example:\n  aureole world --control 127.0.0.1:40000\n\n") + kExitCodesHelp);
+  return c;
+}
+
+CLI::App* AddResize(CLI::App& app, OperateOptions* o) {
+  CLI::App* c = app.add_subcommand("resize", "Divide a running world between more servers, or fewer");
+  AddControl(c, o);
+  c->add_option("--columns", o->columns, "Regions along x")->required()->check(CLI::Range(1, 64));
+  c->add_option("--rows", o->rows, "Regions along z")->check(CLI::Range(1, 64))->capture_default_str();
+  AddWait(c, o);
+  c->footer(std::string("Example:\n  aureole resize --control 127.0.0.1:40000 --columns 3 --rows 2\n\n") +
+            kExitCodesHelp);
+  return c;
+}
+
+CLI::App* AddDrain(CLI::App& app, OperateOptions* o) {
+  CLI::App* c = app.add_subcommand("drain", "Empty a region of a running world; its server then ends");
+  AddControl(c, o);
+  c->add_option("region", o->region, "Its number")->required()->check(CLI::NonNegativeNumber);
+  AddWait(c, o);
+  c->footer(std::string("Example:\n  aureole drain 3 --control 127.0.0.1:40000\n\n") + kExitCodesHelp);
+  return c;
+}
+
+int RunWorldCommand(const OperateOptions& o) {
+  v1::ControlledWorld world;
+  const int code = Call(Reach(o).get(), &Stub::GetWorld, v1::GetControlledWorldRequest(), &world);
+  if (code == kExitOk) Print(world, o.json);
+  return code;
+}
+
+int RunResize(const OperateOptions& o) {
+  const std::unique_ptr<Stub> stub = Reach(o);
+  v1::ResizeLayoutRequest request;
+  request.set_columns(o.columns);
+  request.set_rows(o.rows);
+  v1::ResizeLayoutResponse response;
+  const int code = Call(stub.get(), &Stub::ResizeLayout, request, &response);
+  return code == kExitOk ? Await(stub.get(), o) : code;
+}
+
+int RunDrain(const OperateOptions& o) {
+  const std::unique_ptr<Stub> stub = Reach(o);
+  v1::DrainRegionRequest request;
+  request.set_region(o.region);
+  v1::DrainRegionResponse response;
+  const int code = Call(stub.get(), &Stub::DrainRegion, request, &response);
+  return code == kExitOk ? Await(stub.get(), o) : code;
+}
+
+}  // namespace aureole

@@ -1,0 +1,27 @@
+// What operators do to a running world: `aureole world`, `aureole resize` and `aureole drain`.
+#pragma once
+
+#include <string>
+
+#include <CLI/CLI.hpp>
+
+namespace aureole {
+
+struct OperateOptions {
+  std::string control;
+  int columns = 1, rows = 1;
+  int region = 0;
+  double wait_s = 60;
+  bool json = false;
+};
+
+CLI::App* AddWorld(CLI::App& app, OperateOptions* o);
+CLI::App* AddResize(CLI::App& app, OperateOptions* o);
+CLI::App* AddDrain(CLI::App& app, OperateOptions* o);
+
+// Each returns an exit code.
+int RunWorldCommand(const OperateOptions& o);
+int RunResize(const OperateOptions& o);
+int RunDrain(const OperateOptions& o);
+
+}  // namespace aureole
