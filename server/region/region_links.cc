@@ -185,6 +185,16 @@ bool RegionLinks::caught_up() const {
                      [](const auto& made) { return !made.second.member || made.second.link->caught_up(); });
 }
 
+std::vector<std::string> RegionLinks::Endpoints() const {
+  const std::lock_guard lock(links_mutex_);
+  std::vector<std::string> out;
+  for (const auto& [region, address] : addresses_) {
+    out.resize(std::max(out.size(), static_cast<size_t>(region) + 1));
+    if (region != identity_.self) out[static_cast<size_t>(region)] = address.endpoint;
+  }
+  return out;
+}
+
 void RegionLinks::Send(const std::vector<Frame>& frames) {
   const std::lock_guard lock(links_mutex_);
   for (const Frame& frame : frames) {

@@ -66,6 +66,9 @@ class RegionLinks {
   // Peers that this region has never spoken with, ascending, appended.
   void Unmet(std::vector<RegionId>* out) const;
 
+  // Any thread. Where the others are, by region, as far as was told; this region's place is empty.
+  std::vector<std::string> Endpoints() const;
+
   // Queues the frames; never waits for the network.
   void Send(const std::vector<Frame>& frames);
   // Moves what has arrived to `out`; when that is less than `at_least` frames, waits until it is as much, `deadline`,

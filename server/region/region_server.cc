@@ -120,6 +120,7 @@ struct Process {
   std::unique_ptr<ControlStream> control;
   std::optional<v1::Report> last_report;  // of a run that is over
   std::unique_ptr<HostedRegion> hosted;
+  uint64_t told_epoch = 0;     // of the layout that clients know; of the tick thread
   uint64_t control_epoch = 0;  // the highest that was heard
   bool control_lost = false;
   int64_t start_unix_us = 0;  // 0: not started
@@ -127,6 +128,7 @@ struct Process {
   std::chrono::steady_clock::time_point give_up_joining;
 
   TickLoop::Hooks Hooks();
+  void FollowLayout(const Region& region);
   absl::Status Handle(const v1::ToRegion& message);
   void Join();
   bool Report(const v1::Report& report);
@@ -179,6 +181,19 @@ v1::FromRegion LayoutOutcomeOf(const InputOutcome& outcome) {
   return message;
 }
 
+// The tick thread. Clients hear of a layout that has just come into force; those of a region that has left have to say
+// elsewhere what has not acted yet.
+void Process::FollowLayout(const Region& region) {
+  if (region.phase() == Phase::kLeft) simulation.inputs().Stop();
+  if (region.layout_epoch() == told_epoch) return;
+  told_epoch = region.layout_epoch();
+  std::vector<std::string> endpoints = hosted->links().Endpoints();
+  const auto self = static_cast<size_t>(region.self());
+  endpoints.resize(std::max(endpoints.size(), self + 1));
+  endpoints[self] = server->endpoint();
+  simulation.Follow(region, endpoints);
+}
+
 TickLoop::Hooks Process::Hooks() {
   TickLoop::Hooks hooks;
   hooks.after_tick = [this](const FrameSample& sample) {
@@ -195,6 +210,7 @@ TickLoop::Hooks Process::Hooks() {
   };
   hooks.publish = [this](Region* region, int64_t bodies, const std::vector<Input>& delivered) {
     simulation.inputs().Hear(delivered);
+    FollowLayout(*region);
     simulation.AfterTick(region, bodies);
     recording.AfterTick(*region, delivered);
   };

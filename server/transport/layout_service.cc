@@ -69,6 +69,12 @@ void LayoutService::Serve(const v1::GetWorldResponse& world) {
   world_ = world;
 }
 
+void LayoutService::Follow(const v1::GetWorldResponse& world) {
+  const std::lock_guard lock(mutex_);
+  world_ = world;
+  for (Stream* s : streams_) s->OfferWorld(world_);
+}
+
 void LayoutService::Stop() {
   const std::lock_guard lock(mutex_);
   serving_ = false;

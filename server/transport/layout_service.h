@@ -30,6 +30,8 @@ class LayoutService {
 
   // From here on this is the world.
   void Serve(const v1::GetWorldResponse& world);
+  // The layout has changed; all who watch are told.
+  void Follow(const v1::GetWorldResponse& world);
   // Ends all calls.
   void Stop();
 

@@ -65,6 +65,8 @@ class ReplicaPublisher {
 
   // What frames say of their server.
   void Serve(RegionId region, uint64_t layout_epoch, int64_t tick_us);
+  // From here on frames are of this layout.
+  void Follow(uint64_t layout_epoch) { layout_epoch_ = layout_epoch; }
   // Ends all calls, and those that join from here on. Returns at once.
   void Stop(const grpc::Status& status);
   // From any thread.
@@ -118,7 +120,7 @@ class ReplicaPublisher {
   float RealTimeFactor();
 
   RegionId region_ = kNoRegion;
-  uint64_t layout_epoch_ = 0;
+  std::atomic<uint64_t> layout_epoch_ = 0;
   int64_t tick_us_ = 1;
 
   // Of the tick thread.

@@ -100,17 +100,38 @@ void SimulationService::Serve(const v1::Assignment& assignment, const World& wor
   world_.set_region(assignment.region());
   world_.set_layout_epoch(assignment.layout_epoch());
   *world_.mutable_endpoints() = assignment.endpoints();
-  for (RegionId r = 0; r < world.layout.size(); ++r) {
-    const Rect& rect = world.layout.rect(r);
+  SetLayout(world.layout);
+  scene_.Clear();
+  for (const BodySpec& body : world.environment.fixed) *scene_.Add() = FixedToProto(body);
+  layout_.Serve(world_);
+}
+
+// Holds the mutex.
+void SimulationService::SetLayout(const Layout& layout) {
+  world_.clear_layout();
+  for (RegionId r = 0; r < layout.size(); ++r) {
+    const Rect& rect = layout.rect(r);
     v1::RegionRect* out = world_.add_layout();
     out->set_min_x(rect.min_x);
     out->set_max_x(rect.max_x);
     out->set_min_z(rect.min_z);
     out->set_max_z(rect.max_z);
   }
-  scene_.Clear();
-  for (const BodySpec& body : world.environment.fixed) *scene_.Add() = FixedToProto(body);
-  layout_.Serve(world_);
+}
+
+void SimulationService::Follow(const Region& region, const std::vector<std::string>& endpoints) {
+  replicas_.Follow(region.layout_epoch());
+  const std::lock_guard lock(mutex_);
+  const std::string before = world_.SerializeAsString();
+  world_.set_layout_epoch(region.layout_epoch());
+  world_.clear_endpoints();
+  const std::vector<RegionId>& members = region.members();
+  for (RegionId r = 0; r < region.layout().size(); ++r) {
+    const bool member = std::binary_search(members.begin(), members.end(), r);
+    world_.add_endpoints(member && static_cast<size_t>(r) < endpoints.size() ? endpoints[static_cast<size_t>(r)] : "");
+  }
+  SetLayout(region.layout());
+  if (world_.SerializeAsString() != before) layout_.Follow(world_);
 }
 
 void SimulationService::Stop() {

@@ -4,6 +4,8 @@
 
 #include <atomic>
 #include <mutex>
+#include <string>
+#include <vector>
 
 #include <grpcpp/server_context.h>
 #include <grpcpp/support/byte_buffer.h>
@@ -50,6 +52,8 @@ class SimulationService final : public SimulationCalls {
 
   // From here on this region is served.
   void Serve(const v1::Assignment& assignment, const World& world);
+  // The layout that is in force in `region`, and where its members are, by region; clients that watch it are told.
+  void Follow(const Region& region, const std::vector<std::string>& endpoints);
   // Ends all calls.
   void Stop();
   // After each tick, from the tick thread; `bodies`: that this region owns. Cost: ReplicaPublisher::AfterTick.
@@ -65,6 +69,8 @@ class SimulationService final : public SimulationCalls {
   std::atomic<Tick> tick_ = 0;
   std::atomic<int64_t> bodies_ = 0;
   std::mutex mutex_;
+  void SetLayout(const Layout& layout);
+
   bool serving_ = false;
   v1::GetWorldResponse world_;  // without scene
   google::protobuf::RepeatedPtrField<v1::FixedBody> scene_;

@@ -9,8 +9,10 @@
 #include <cstdlib>
 #include <filesystem>
 #include <map>
+#include <thread>
 
 #include "aureole/v1/control_plane.grpc.pb.h"
+#include "aureole/v1/simulation.grpc.pb.h"
 #include "server/control/layout_desk.h"
 #include "server/control/local_allocator.h"
 #include "server/control/run.h"
@@ -212,7 +214,23 @@ TEST_F(LayoutRunTest, OperatorsResizeAndDrainByCalls) {
     EXPECT_TRUE(s.ok()) << s.error_message();
     return out;
   };
+  // What a client hears that watches a server which stays.
+  std::string server;
+  std::vector<v1::GetWorldResponse> heard;
+  std::thread watcher;
+  const auto watch = [&] {
+    const auto stub = v1::Simulation::NewStub(grpc::CreateChannel(server, grpc::InsecureChannelCredentials()));
+    grpc::ClientContext context;
+    context.set_deadline(std::chrono::system_clock::now() + std::chrono::seconds(60));
+    const auto stream = stub->WatchLayout(&context, {});
+    v1::LayoutUpdate update;
+    while (stream->Read(&update)) {
+      if (update.has_world()) heard.push_back(update.world());
+    }
+    stream->Finish();
+  };
   Run({[&] {
+         watcher = std::thread(watch);
          EXPECT_EQ(resize(0).error_code(), grpc::StatusCode::INVALID_ARGUMENT);
          EXPECT_EQ(drain(7).error_code(), grpc::StatusCode::INVALID_ARGUMENT);
          EXPECT_EQ(world().layout_epoch(), 1u);
@@ -234,8 +252,20 @@ TEST_F(LayoutRunTest, OperatorsResizeAndDrainByCalls) {
        }},
       [&](const RunStatus& status) {
         control = status.control;
+        server = status.regions[0].endpoint;
         return true;
       });
+  watcher.join();
+  // Begun, three columns, one without area, two columns.
+  ASSERT_EQ(heard.size(), 4u);
+  for (size_t i = 0; i < heard.size(); ++i) EXPECT_EQ(heard[i].layout_epoch(), i + 1);
+  EXPECT_EQ(heard[0].endpoints_size(), 2);
+  EXPECT_EQ(heard[1].endpoints_size(), 3);
+  EXPECT_NE(heard[2].endpoints(1), "");
+  EXPECT_EQ(heard[2].layout(1).min_x(), heard[2].layout(1).max_x());
+  EXPECT_EQ(heard[3].endpoints(0), server);
+  EXPECT_EQ(heard[3].endpoints(1), "");
+  EXPECT_EQ(heard[3].endpoints(2), heard[1].endpoints(2));
   ExpectExact();
 }
 
