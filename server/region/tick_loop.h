@@ -117,7 +117,7 @@ class TickLoop {
   size_t replayed_ = 0;        // of options_.replay
   std::vector<Input> logged_;  // being made durable, for the next tick
   Tick checkpointed_ = 0;
-  Tick log_until_ = 0;                                   // of all regions that were loaded with this one
+  Tick log_until_ = 0;           // of all regions that were loaded with this one
   uint64_t followed_epoch_ = 0;  // 0: none yet
   Tick followed_next_ = 0;
   std::deque<aureole::Checkpoint::Hash> recent_hashes_;  // that may not have reached the control plane
