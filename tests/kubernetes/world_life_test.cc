@@ -13,9 +13,11 @@
 #include <absl/strings/str_format.h>
 
 #include "server/control/kubernetes/api_client.h"
+#include "server/control/kubernetes/pod.h"
 #include "server/control/local_allocator.h"
 #include "server/control/run.h"
 #include "server/control/world_file.h"
+#include "server/transport/health_check.h"
 #include "tests/kubernetes/fake_cluster.h"
 
 namespace aureole::kubernetes {
@@ -28,7 +30,7 @@ using Clock = std::chrono::steady_clock;
 constexpr char kWorlds[] = "/apis/aureole.dev/v1alpha1/namespaces/test/worlds/";
 constexpr char kPods[] = "/api/v1/namespaces/test/pods/";
 constexpr char kFile[] = AUREOLE_WORLDS "/border-pile.json";
-constexpr int kSeconds = 8;  // of simulated time
+constexpr int kSeconds = 6;  // of simulated time
 
 bool Await(const std::function<bool()>& condition, seconds at_most = seconds(60)) {
   const auto end = Clock::now() + at_most;
@@ -118,6 +120,13 @@ TEST_F(WorldLife, RunsToItsEndAndSaysSo) {
   EXPECT_GT(IntegerAt(Status(), {"bodies"}), 200);
   EXPECT_EQ(TextAt(Status()["regions"][1], {"pod"}), "w-r1-i1");
   EXPECT_FALSE(TextAt(Status()["regions"][1], {"node"}).empty());
+  const std::string ip = TextAt(*cluster_.api().At(absl::StrCat(kPods, "control-0")), {"status", "podIP"});
+  EXPECT_TRUE(CheckHealth(ip + ":7100").ok());
+  const auto metrics = httplib::Client(ip, 9100).Get("/metrics");
+  ASSERT_TRUE(metrics);
+  for (const char* line : {"aureole_control_leader 1\n", "aureole_control_epoch 1\n", "aureole_control_worlds 1\n"}) {
+    EXPECT_TRUE(absl::StrContains(metrics->body, line)) << line;
+  }
   ExpectEndAsUndisturbed();
   EXPECT_TRUE(Await([&] { return cluster_.Pods("w").empty(); }));
   EXPECT_TRUE(Await([&] { return HasEvent("Running") && HasEvent("Finished"); }));
@@ -166,8 +175,10 @@ TEST_F(WorldLife, NextLeaderTakesOverWhatRuns) {
   cluster_.StartControl(0);
   ASSERT_TRUE(Await([&] { return cluster_.Leader() == 0; }));
   cluster_.StartControl(1);
+  const std::string standby = TextAt(*cluster_.api().At(absl::StrCat(kPods, "control-1")), {"status", "podIP"});
+  EXPECT_TRUE(Await([&] { return CheckHealth(standby + ":7100").ok(); })) << "it is as ready as the leader";
   Create(Spec());
-  ASSERT_TRUE(AwaitTick(100));
+  ASSERT_TRUE(AwaitTick(20));
   const pid_t servers[] = {cluster_.ProcessOf("w-r0-i1"), cluster_.ProcessOf("w-r1-i1")};
   cluster_.SignalControl(0, SIGKILL);
   ASSERT_TRUE(Await([&] { return cluster_.Leader() == 1; }));
@@ -245,6 +256,39 @@ TEST_F(WorldLife, RefusedWorldSaysWhyAndRunsOnceItIsRight) {
   EXPECT_TRUE(Await([&] { return HasEvent("Refused"); }));
   cluster_.api().Merge(absl::StrCat(kWorlds, "w"), {{"spec", {{"world", {{"bodys", nullptr}}}}}});
   ASSERT_TRUE(AwaitTick(10));
+}
+
+TEST_F(WorldLife, RunThatFailedIsToldAndTriedAgain) {
+  cluster_.StartControl(0);
+  cluster_.api().Inject({.kind = Fault::Kind::kStatus,
+                         .method = "POST",
+                         .target = "/pods",
+                         .times = 11,  // six in a row of one of the two regions, whichever
+                         .status = 403,
+                         .reason = "Forbidden"});
+  Create(Spec());
+  ASSERT_TRUE(Await([&] { return Phase() == "Failed"; }));
+  EXPECT_EQ(Condition("Ready", "reason"), "RunFailed");
+  EXPECT_TRUE(absl::StrContains(Condition("Ready", "message"), "its Pod cannot be made: POST"))
+      << Condition("Ready", "message");
+  cluster_.api().Merge(absl::StrCat(kWorlds, "w"), {{"spec", {{"image", "another"}}}});  // does not wait for its time
+  ExpectEndAsUndisturbed();
+}
+
+// It was about to remove the Pods.
+TEST_F(WorldLife, WhatALeaderLeftOfAFinishedWorldGoes) {
+  Create(Spec());
+  PodTemplate pods;
+  pods.world = "w";
+  pods.space = "test";
+  pods.uid = TextAt(cluster_.World("w"), {"metadata", "uid"});
+  cluster_.api().Merge(absl::StrCat(kWorlds, "w"), {{"status", {{"phase", "Finished"}}}});
+  cluster_.LoseNode("n1", false);
+  cluster_.LoseNode("n2", false);
+  cluster_.api().Put(absl::StrCat(kPods, "w-r0-i1"), PodManifest(pods, {0, 1, "t", "127.0.0.1:1"}));
+  cluster_.StartControl(0);
+  EXPECT_TRUE(Await([&] { return cluster_.Pods("w").empty(); }));
+  EXPECT_EQ(Phase(), "Finished");
 }
 
 TEST_F(WorldLife, ChangeThatCannotBeIsSaidAndTheRunGoesOn) {

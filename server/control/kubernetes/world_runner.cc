@@ -160,15 +160,22 @@ WorldRunner::Next WorldRunner::Try(const Json& object) {
     return Refuse(generation, "Failed", "CannotChange",
                   "spec.world: has changed while the world ran; change it back, or delete the World and make it anew");
   }
-  if (TextAt(status, {"phase"}) == "Finished") return Next::kOnChange;
+  if (TextAt(status, {"phase"}) == "Finished") {
+    PodAllocator(context_->client, PodOptions(*world)).Kill();  // what the last control plane had no time for
+    return Next::kOnChange;
+  }
   return RunOnce(*world);
 }
 
-WorldRunner::Next WorldRunner::RunOnce(WorldResource world) {
+PodAllocator::Options WorldRunner::PodOptions(const WorldResource& world) const {
   PodAllocator::Options options = context_->pods;
   options.pods = world.pods;
   options.leads = context_->leads;
-  PodAllocator allocator(context_->client, options);
+  return options;
+}
+
+WorldRunner::Next WorldRunner::RunOnce(WorldResource world) {
+  PodAllocator allocator(context_->client, PodOptions(world));
 
   RunOptions run = world.run;
   run.hub = context_->hub;
@@ -186,6 +193,7 @@ WorldRunner::Next WorldRunner::RunOnce(WorldResource world) {
   std::string not_applied;
   int64_t looked_at = 0;  // generation
   Clock::time_point next_publish;
+  Stage stage = Stage::kJoining;
   const auto publish = [&](const RunStatus& now) {
     WorldStatus status = StatusOf(world, now, allocator.Newest());
     status.conditions.push_back(Applied(not_applied));
@@ -201,8 +209,9 @@ WorldRunner::Next WorldRunner::RunOnce(WorldResource world) {
       allocator.Use(world.pods);
       if (!not_applied.empty()) Tell(true, "CannotChange", not_applied);
     }
-    if (Clock::now() >= next_publish) {
+    if (Clock::now() >= next_publish || now.stage != stage) {
       next_publish = Clock::now() + kPublishEvery;
+      stage = now.stage;
       publish(now);
     }
     if (stopping_) store_.Publish(StoppedStatus(world.generation, "Draining", "Deleted", "its servers stop"));
