@@ -130,7 +130,7 @@ pid_t FakeCluster::Spawn(const std::vector<std::string>& words, const std::vecto
   return pid;
 }
 
-void FakeCluster::StartControl(int index) {
+void FakeCluster::StartControl(int index, const std::vector<std::string>& flags) {
   const std::string name = absl::StrCat("control-", index), ip = Address();
   const std::string path = absl::StrCat(kPods, "/", name);
   api_.Remove(path);
@@ -138,8 +138,10 @@ void FakeCluster::StartControl(int index) {
                   {"spec", {{"containers", Json::array({{{"name", "control"}, {"image", "aureole"}}})}}},
                   {"status", {{"podIP", ip}}}});
   const std::lock_guard lock(mutex_);
-  controls_[index].pid = Spawn({AUREOLE_CONTROL, "kubernetes", "--listen", absl::StrCat(ip, ":", kControlPort),
-                                "--lease-seconds", "3", "--metrics", absl::StrCat(ip, ":9100")},
+  std::vector<std::string> words = {AUREOLE_CONTROL,   "kubernetes", "--listen",  absl::StrCat(ip, ":", kControlPort),
+                                    "--lease-seconds", "3",          "--metrics", absl::StrCat(ip, ":9100")};
+  words.insert(words.end(), flags.begin(), flags.end());
+  controls_[index].pid = Spawn(words,
                                {absl::StrCat("KUBECONFIG=", (directory_ / "kubeconfig").string()),
                                 absl::StrCat("POD_NAME=", name), "POD_NAMESPACE=test", absl::StrCat("POD_IP=", ip)},
                                directory_ / absl::StrCat(name, ".log"));

@@ -13,12 +13,14 @@
 #include <absl/strings/str_cat.h>
 #include <absl/strings/str_format.h>
 
+#include "server/control/certificates.h"
 #include "server/control/kubernetes/api_client.h"
 #include "server/control/kubernetes/pod.h"
 #include "server/control/local_allocator.h"
 #include "server/control/run.h"
 #include "server/control/world_file.h"
 #include "server/transport/health_check.h"
+#include "server/transport/security.h"
 #include "tests/kubernetes/fake_cluster.h"
 
 namespace aureole::kubernetes {
@@ -322,6 +324,23 @@ TEST_F(WorldLife, WorldsOfOneControlPlaneDoNotMix) {
   ExpectEndAsUndisturbed();
   ASSERT_TRUE(Await([&] { return TextAt(cluster_.World("v"), {"status", "phase"}) == "Finished"; }));
   EXPECT_EQ(TextAt(cluster_.World("v"), {"status", "hash", "hash"}), TextAt(Status(), {"hash", "hash"}));
+}
+
+TEST_F(WorldLife, ServersAndControlPlanesShowEachOtherTheirCertificates) {
+  const std::string tls = cluster_.disk() + "/tls";
+  std::filesystem::create_directories(tls);
+  ASSERT_TRUE(WriteCertificates(tls, {}, absl::Hours(1)).ok());
+  cluster_.StartControl(0, {"--tls", tls});
+  Create(Spec());
+  ASSERT_TRUE(AwaitTick(50));
+  const std::string ip = TextAt(*cluster_.api().At(absl::StrCat(kPods, "control-0")), {"status", "podIP"});
+  EXPECT_FALSE(CheckHealth(ip + ":7100").ok()) << "in plain text";
+  SecurityOptions security;
+  security.tls = tls;
+  EXPECT_TRUE(CheckHealth(ip + ":7100", (*Security::Open(security))->channel()).ok());
+  kill(cluster_.ProcessOf("w-r1-i1"), SIGKILL);
+  ASSERT_TRUE(Await([&] { return Incarnation(1) == 2; }));
+  ExpectEndAsUndisturbed();
 }
 
 struct FaultCase {
