@@ -291,6 +291,14 @@ TEST_F(WorldLife, WhatALeaderLeftOfAFinishedWorldGoes) {
   cluster_.api().Put(absl::StrCat(kPods, "w-r0-i1"), PodManifest(pods, {0, 1, "t", "127.0.0.1:1"}));
   cluster_.StartControl(0);
   EXPECT_TRUE(Await([&] { return cluster_.Pods("w").empty(); }));
+  for (const int seed : {2, 3}) {  // too late; the second is read after the first was dealt with
+    const auto reads = [this] {
+      return cluster_.api().Count("GET /apis/aureole.dev/v1alpha1/namespaces/test/worlds/w");
+    };
+    const int before = reads();
+    cluster_.api().Merge(absl::StrCat(kWorlds, "w"), {{"spec", {{"world", {{"seed", seed}}}}}});
+    EXPECT_TRUE(Await([&] { return reads() > before; }));
+  }
   EXPECT_EQ(Phase(), "Finished");
 }
 

@@ -65,7 +65,7 @@ absl::Status LabelLeader(ApiClient* client, const std::string& pod) {
       labelled = true;
       continue;
     }
-    const absl::Status s = client->Patch(pods, name, {.body = Role(nullptr)}).status();
+    absl::Status s = client->Patch(pods, name, {.body = Role(nullptr)}).status();
     if (!s.ok() && !absl::IsNotFound(s)) return s;
   }
   return labelled ? absl::OkStatus() : client->Patch(pods, pod, {.body = Role(kLeader)}).status();

@@ -138,6 +138,14 @@ WorldRunner::Next WorldRunner::Try(const Json& object) {
   }
   if (!record.ok()) return Next::kSoon;
   const Json status = store_.there();
+  if (TextAt(status, {"phase"}) == "Finished") {  // for good, whatever changes
+    PodTemplate pods;
+    pods.world = name_;
+    pods.space = space_;
+    pods.uid = uid_;
+    PodAllocator(context_->client, PodOptions(pods)).Kill();  // what the last control plane had no time for
+    return Next::kOnChange;
+  }
   const absl::StatusOr<std::optional<std::string>> file = ReadSource(object);
   if (!file.ok()) {
     Refuse(generation, "Pending", "SourceUnreadable", std::string(file.status().message()));
@@ -160,22 +168,18 @@ WorldRunner::Next WorldRunner::Try(const Json& object) {
     return Refuse(generation, "Failed", "CannotChange",
                   "spec.world: has changed while the world ran; change it back, or delete the World and make it anew");
   }
-  if (TextAt(status, {"phase"}) == "Finished") {
-    PodAllocator(context_->client, PodOptions(*world)).Kill();  // what the last control plane had no time for
-    return Next::kOnChange;
-  }
   return RunOnce(*world);
 }
 
-PodAllocator::Options WorldRunner::PodOptions(const WorldResource& world) const {
+PodAllocator::Options WorldRunner::PodOptions(const PodTemplate& pods) const {
   PodAllocator::Options options = context_->pods;
-  options.pods = world.pods;
+  options.pods = pods;
   options.leads = context_->leads;
   return options;
 }
 
 WorldRunner::Next WorldRunner::RunOnce(WorldResource world) {
-  PodAllocator allocator(context_->client, PodOptions(world));
+  PodAllocator allocator(context_->client, PodOptions(world.pods));
 
   RunOptions run = world.run;
   run.hub = context_->hub;

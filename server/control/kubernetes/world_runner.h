@@ -68,7 +68,7 @@ class WorldRunner {
   void Run();
   Next Try(const Json& object);
   Next RunOnce(WorldResource world);
-  PodAllocator::Options PodOptions(const WorldResource& world) const;
+  PodAllocator::Options PodOptions(const PodTemplate& pods) const;
   // The text that the World's worldFrom points to; nothing when it is not there, or there is no worldFrom.
   absl::StatusOr<std::optional<std::string>> ReadSource(const Json& object);
   Next Refuse(int64_t generation, const std::string& phase, const std::string& reason, const std::string& message);
