@@ -93,29 +93,32 @@ class Storage(WorldTest):
         wait_for(lambda: any(all(w in message for w in words) for _, message in self.world.events()),
                  f"an event with {words}, of {self.world.events()}")
 
-    def region(self, number):
-        return self.world.directory / self.world.name / f"region-{number}"
+    def checkpoints(self, number):
+        """The directory of the region's first incarnation."""
+        return self.world.directory / self.world.name / f"region-{number}" / "i1"
 
     def test_volume_that_becomes_read_only_is_an_event(self):
-        wait_for(lambda: (self.region(2) / "checkpoint").exists(), "a checkpoint")
-        self.region(2).chmod(0o500)
-        self.addCleanup(self.region(2).chmod, 0o700)
-        self.events_say("checkpoint")
+        wait_for(lambda: (self.checkpoints(2) / "checkpoint").exists(), "a checkpoint")
+        self.checkpoints(2).chmod(0o500)
+        self.events_say("region 2", "not protected")
+        wait_for(lambda: self.world.condition("Degraded").get("status") == "True", "the condition Degraded")
         self.world.ticks.goes_on(50)
-        self.region(2).chmod(0o700)
+        self.checkpoints(2).chmod(0o700)
+        self.events_say("region 2", "is protected")
         self.assert_exact()
 
-    def test_damaged_checkpoint_is_an_event_and_the_world_waits(self):
-        wait_for(lambda: (self.region(1) / "checkpoint").exists(), "a checkpoint")
+    def test_damaged_checkpoint_ends_the_run_and_is_an_event(self):
+        wait_for(lambda: (self.checkpoints(1) / "checkpoint").exists(), "a checkpoint")
         pod = self.world.pod_of(1)["metadata"]["name"]
         # It is replaced every second by a good one: hold the directory still, then damage what is there.
-        self.region(1).chmod(0o500)
-        file = self.region(1) / "checkpoint"
+        self.checkpoints(1).chmod(0o500)
+        file = self.checkpoints(1) / "checkpoint"
         content = bytearray(file.read_bytes())
         content[len(content) // 2] ^= 0xFF
         file.write_bytes(content)
         signal_pod(pod, signal.SIGKILL)
-        self.events_say("checkpoint")
+        self.events_say("region 1", "the checkpoint's check sum is wrong")
+        wait_for(lambda: self.world.status().get("phase") == "Failed", "the phase Failed")
 
 
 @needs_the_machine
@@ -131,7 +134,7 @@ class FullDisk(WorldTest):
 
     def test_full_disk_is_an_event_and_the_world_goes_on(self):
         subprocess.run(["dd", "if=/dev/zero", f"of={self.disk}/ballast", "bs=64k"], capture_output=True)
-        wait_for(lambda: any("checkpoint" in m for _, m in self.world.events()), f"an event, of {self.world.events()}")
+        wait_for(lambda: any("not protected" in m and "No space left" in m for _, m in self.world.events()), "an event")
         self.world.ticks.goes_on(50)
         os.remove(f"{self.disk}/ballast")
         self.assert_exact()
