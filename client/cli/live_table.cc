@@ -3,6 +3,7 @@
 #include <sys/ioctl.h>
 
 #include <algorithm>
+#include <utility>
 
 #include <absl/strings/str_cat.h>
 #include <absl/strings/str_format.h>
@@ -20,13 +21,14 @@ double Seconds(const Heading& heading, Tick tick) {
 struct Total {
   v1::FrameTime frame;  // of the slowest region in each figure
   size_t slowest = 0;
-  double real_time_factor = 0;  // of the slowest region
+  double real_time_factor = 0;  // of the slowest member
   double bytes_per_second = 0;
   int64_t auras = 0, transfers = 0, waits = 0, wait_us = 0, violations = 0;
 };
 
 Total Sum(const RunStatus& status) {
   Total t;
+  bool any = false;
   for (size_t i = 0; i < status.regions.size(); ++i) {
     const RegionStatus& r = status.regions[i];
     if (r.frame.max_ms() > t.frame.max_ms()) t.slowest = i;
@@ -34,7 +36,7 @@ Total Sum(const RunStatus& status) {
     t.frame.set_p99_ms(std::max(t.frame.p99_ms(), r.frame.p99_ms()));
     t.frame.set_max_ms(std::max(t.frame.max_ms(), r.frame.max_ms()));
     const double factor = r.report.real_time_factor();
-    t.real_time_factor = i == 0 ? factor : std::min(t.real_time_factor, factor);
+    if (r.member) t.real_time_factor = std::exchange(any, true) ? std::min(t.real_time_factor, factor) : factor;
     t.bytes_per_second += r.bytes_per_second;
     t.auras += r.report.auras_told();
     t.transfers += r.report.transfers();
