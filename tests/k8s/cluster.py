@@ -328,8 +328,8 @@ class WorldTest(ClusterTest):
         self.began = time.monotonic()
 
     def _say_why(self):
-        outcome = self._outcome  # unittest's own record of what failed so far
-        failed = not outcome.success if hasattr(outcome, "success") else True
+        result = self._outcome.result
+        failed = any(test is self for test, _ in result.failures + result.errors)
         if failed:
             print(f"\n--- status: {json.dumps({k: v for k, v in self.world.status().items() if k != 'record'})}"
                   f"\n--- events: {self.world.events()}\n{self.world.logs()}", flush=True)

@@ -75,7 +75,7 @@ class Leader(WorldTest):
 
     @needs_the_machine
     def test_region_that_dies_while_nobody_leads_is_replaced_by_the_next_leader(self):
-        names = [p["metadata"]["name"] for p in pods(CONTROL)]
+        names = [p["metadata"]["name"] for p in pods(CONTROL) if "deletionTimestamp" not in p["metadata"]]
         region = self.world.pod_of(3)["metadata"]["name"]
         for name in names:
             signal_pod(name, signal.SIGKILL)
