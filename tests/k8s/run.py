@@ -38,7 +38,7 @@ parser.add_argument("--filter", default="")
 options = parser.parse_args()
 rows = []
 # What takes nodes away comes last.
-order = ["image", "manifests", "access", "production", "world", "failures", "leader", "maintenance", "nodes", "scale"]
+order = ["image", "manifests", "access", "production", "world", "failures", "leader", "maintenance", "nodes"]
 found = list(tests_of(unittest.defaultTestLoader.discover(pathlib.Path(__file__).parent, "*_test.py")))
 found.sort(key=lambda t: order.index(t.id().split("_test.")[0]) if t.id().split("_test.")[0] in order else 0)
 chosen = [t for t in found if re.search(options.filter, t.id())]

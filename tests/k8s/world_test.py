@@ -2,7 +2,7 @@
 
 import json
 
-from cluster import World, WorldTest, aureole, get, kubectl, wait_for
+from cluster import SOURCE, World, WorldTest, aureole, get, kubectl, wait_for
 
 READY_S = 15
 
@@ -85,7 +85,7 @@ class Refusals(WorldTest):
         self.assertEqual(world.pods(), [])
 
     def test_bad_world_file_is_refused_with_its_field(self):
-        wrong = json.loads((World("x", "demo.json").file).read_text())
+        wrong = json.loads((SOURCE / "tests/worlds/demo.json").read_text())
         wrong["bodies"][0]["shpe"] = {}
         self.refused("bodies[0].shpe", world=wrong)
 
