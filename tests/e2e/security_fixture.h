@@ -19,6 +19,7 @@
 #include "aureole/v1/control.grpc.pb.h"
 #include "aureole/v1/error.pb.h"
 #include "server/control/certificates.h"
+#include "server/control/control_plane_service.h"
 #include "server/control/control_service.h"
 #include "server/control/issue_token.h"
 #include "server/control/write_file.h"
@@ -87,6 +88,7 @@ inline std::unique_ptr<Security> Open(const std::string& tls, const std::string&
 }
 
 // All services behind one guard, as region 1 of 2, without a world: a call that is admitted is UNAVAILABLE, NO_REGION.
+// Only the operators' calls are answered, of a world that is not there either.
 class GuardedServer {
  public:
   explicit GuardedServer(std::unique_ptr<Security> security, const std::string& world = "here")
@@ -101,6 +103,7 @@ class GuardedServer {
     guard.Register(&builder, v1::Simulation::service_full_name(), &simulation_);
     guard.Register(&builder, v1::Recording::service_full_name(), &recording_);
     guard.Register(&builder, v1::Control::service_full_name(), &control_);
+    guard.Register(&builder, v1::ControlPlane::service_full_name(), &operators_);
     server_ = builder.BuildAndStart();
     peers_.Serve(Identity(1), {&link_});
   }
@@ -140,6 +143,9 @@ class GuardedServer {
   SimulationService simulation_;
   RecordingService recording_;
   ControlService control_;
+  const World world_{*Layout::Columns({})};
+  LayoutDesk desk_{world_};
+  ControlPlaneService operators_{desk_, [] { return RunStatus(); }};
   PeerLink link_;
   int port_ = 0;
   std::unique_ptr<grpc::Server> server_;

@@ -178,9 +178,14 @@ TEST_F(GuardedCalls, EveryMethodWantsItsRightAndNoOther) {
     EXPECT_EQ(Call(channel, path), access.server ? "NOT_A_SERVER there is no certificate" : "NO_TOKEN") << method;
     for (const auto& [right, token] : tokens) {
       const bool granted = right == access.right;
-      EXPECT_EQ(Call(channel, path, token), access.server ? "NOT_A_SERVER no token opens it"
-                                            : granted     ? "NO_REGION"
-                                                          : "NO_RIGHT")
+      const std::string said = Call(channel, path, token);
+      if (granted && method.starts_with(v1::ControlPlane::service_full_name())) {
+        EXPECT_TRUE(!said.empty() && !said.starts_with("NO_")) << method << " is answered by its handler: " << said;
+        continue;
+      }
+      EXPECT_EQ(said, access.server ? "NOT_A_SERVER no token opens it"
+                      : granted     ? "NO_REGION"
+                                    : "NO_RIGHT")
           << method << " with " << v1::Token::Right_Name(right);
     }
   }
