@@ -1,6 +1,5 @@
 #include "server/control/run.h"
 
-#include <grpcpp/ext/proto_server_reflection_plugin.h>
 #include <grpcpp/grpcpp.h>
 
 #include <memory>
@@ -14,6 +13,7 @@
 #include <absl/strings/str_split.h>
 
 #include "server/control/control_plane_service.h"
+#include "server/control/control_port.h"
 #include "server/control/interrupts.h"
 #include "server/control/layout_run.h"
 #include "server/control/reconcile.h"
@@ -177,13 +177,9 @@ class Runner {
     if (!security.ok()) return security.status();
     security_ = *std::move(security);
     if (absl::Status s = security_->CheckListen(options_.listen, false); !s.ok()) return s;
-    grpc::EnableDefaultHealthCheckService(true);
-    grpc::reflection::InitProtoReflectionServerBuilderPlugin();
     grpc::ServerBuilder builder;
+    ConfigureControlPort(&builder);
     int port = 0;
-    builder.AddChannelArgument(GRPC_ARG_ALLOW_REUSEPORT, 0);  // else a second control plane would share the port
-    // Servers ask every 5 s whether this machine is still there; they are not to be taken for a flood.
-    builder.AddChannelArgument(GRPC_ARG_HTTP2_MIN_RECV_PING_INTERVAL_WITHOUT_DATA_MS, 2500);
     // Servers that run look for it where it was.
     const bool any = absl::EndsWith(options_.listen, ":0") && !record_.control().empty();
     const std::string listen = any ? record_.control() : options_.listen;

@@ -10,7 +10,7 @@
 #include "server/control/local_allocator.h"
 #include "server/control/run.h"
 #include "server/control/sqlite_store.h"
-#include "server/control/world_file.h"
+#include "tests/e2e/exact_run.h"
 #include "tests/e2e/killer.h"
 
 namespace aureole {
@@ -28,15 +28,7 @@ class ControlRestart : public testing::Test {
   ~ControlRestart() override { fs::remove_all(directory_); }
 
   static RunOptions OptionsFor(const std::string& world, Tick last_tick) {
-    const absl::StatusOr<WorldFile> file = OpenWorldFile(std::string(AUREOLE_WORLDS "/") + world);
-    EXPECT_TRUE(file.ok()) << file.status();
-    RunOptions options;
-    options.world = file->spec;
-    options.regions = file->world.layout.size();
-    options.last_tick = last_tick;
-    options.hash_every = 10;
-    options.checkpoint_every = 40;
-    return options;
+    return aureole::OptionsFor(world, last_tick, 10, 40);
   }
 
   // One control plane, until the run ends or `observe` says that it leaves.
@@ -64,23 +56,7 @@ class ControlRestart : public testing::Test {
         [this](const RunEvent& e) { events_ += "region " + std::to_string(e.region) + ": " + e.what + "\n"; });
   }
 
-  void ExpectExact(RunOptions options) {
-    options.undivided = options.no_real_time = true;
-    options.regions = 1;
-    options.checkpoint_every = 0;
-    LocalAllocator allocator({});
-    RunResult whole;
-    ASSERT_TRUE(RunWorld(
-                    options, allocator, [](const RunStatus&) { return true; }, &whole)
-                    .ok());
-    ASSERT_EQ(result_.hashes.size(), whole.hashes.size()) << "those that only the first control plane heard are told";
-    for (size_t i = 0; i < whole.hashes.size(); ++i) {
-      EXPECT_EQ(result_.hashes[i].tick, whole.hashes[i].tick);
-      EXPECT_EQ(result_.hashes[i].regions, static_cast<int>(result_.status.regions.size()));
-      EXPECT_EQ(result_.hashes[i].hash, whole.hashes[i].hash) << "tick " << whole.hashes[i].tick;
-      EXPECT_EQ(result_.hashes[i].bodies, whole.hashes[i].bodies) << "tick " << whole.hashes[i].tick;
-    }
-  }
+  void ExpectExact(const RunOptions& options) const { aureole::ExpectExact(result_, options); }
   std::string LogOf(int region) const {
     std::ifstream in(directory_ / "logs" / ("region-" + std::to_string(region) + ".log"));
     return {std::istreambuf_iterator<char>(in), {}};

@@ -14,7 +14,7 @@
 #include "client/src/push_sender.h"
 #include "server/control/local_allocator.h"
 #include "server/control/run.h"
-#include "server/control/world_file.h"
+#include "tests/e2e/exact_run.h"
 #include "tests/e2e/killer.h"
 #include "tests/e2e/running_world.h"
 
@@ -56,15 +56,7 @@ class Recovery : public testing::Test {
   ~Recovery() override { fs::remove_all(directory_); }
 
   static RunOptions OptionsFor(const std::string& world, Tick last_tick) {
-    const absl::StatusOr<WorldFile> file = OpenWorldFile(std::string(AUREOLE_WORLDS "/") + world);
-    EXPECT_TRUE(file.ok()) << file.status();
-    RunOptions options;
-    options.world = file->spec;
-    options.regions = file->world.layout.size();
-    options.last_tick = last_tick;
-    options.hash_every = 25;
-    options.checkpoint_every = 40;
-    return options;
+    return aureole::OptionsFor(world, last_tick, 25, 40);
   }
 
   absl::Status Run(const RunOptions& options, const RunObserver& observe) {
@@ -76,24 +68,7 @@ class Recovery : public testing::Test {
     return s;
   }
 
-  // Every hash is there, and is that of the undivided world.
-  void ExpectExact(RunOptions options) {
-    options.undivided = options.no_real_time = true;
-    options.regions = 1;
-    options.checkpoint_every = 0;
-    LocalAllocator allocator({});
-    RunResult whole;
-    ASSERT_TRUE(RunWorld(
-                    options, allocator, [](const RunStatus&) { return true; }, &whole)
-                    .ok());
-    ASSERT_EQ(result_.hashes.size(), whole.hashes.size());
-    for (size_t i = 0; i < whole.hashes.size(); ++i) {
-      EXPECT_EQ(result_.hashes[i].tick, whole.hashes[i].tick);
-      EXPECT_EQ(result_.hashes[i].regions, static_cast<int>(result_.status.regions.size()));
-      EXPECT_EQ(result_.hashes[i].hash, whole.hashes[i].hash) << "tick " << whole.hashes[i].tick;
-      EXPECT_EQ(result_.hashes[i].bodies, whole.hashes[i].bodies) << "tick " << whole.hashes[i].tick;
-    }
-  }
+  void ExpectExact(const RunOptions& options) const { aureole::ExpectExact(result_, options); }
 
   fs::path directory_;
   RunResult result_;

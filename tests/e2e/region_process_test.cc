@@ -13,24 +13,13 @@
 #include "client/src/replica_decoder.h"
 #include "server/control/local_allocator.h"
 #include "server/control/run.h"
-#include "server/control/world_file.h"
 #include "server/transport/health_check.h"
+#include "tests/e2e/exact_run.h"
 
 namespace aureole {
 namespace {
 
 using std::chrono::steady_clock;
-
-RunOptions OptionsFor(const std::string& world, Tick last_tick) {
-  const absl::StatusOr<WorldFile> file = OpenWorldFile(std::string(AUREOLE_WORLDS "/") + world);
-  EXPECT_TRUE(file.ok()) << file.status();
-  RunOptions options;
-  options.world = file->spec;
-  options.regions = file->world.layout.size();
-  options.last_tick = last_tick;
-  options.hash_every = 50;
-  return options;
-}
 
 RunResult RunRegions(const RunOptions& options, const RunObserver& observe) {
   LocalAllocator allocator({});
@@ -57,7 +46,7 @@ void ExpectSameHashes(const RunResult& a, const RunResult& b) {
 }
 
 TEST(RegionProcess, CuttingConnectionsAHundredTimesChangesNoBit) {
-  const RunOptions options = OptionsFor("corner-storm.json", 700);
+  const RunOptions options = OptionsFor("corner-storm.json", 700, 50);
   size_t cuts = 0;
   const RunResult split = RunRegions(options, [&](const RunStatus& status) {
     if (status.stage != Stage::kRunning || status.MinTick() < 10 || status.MaxTick() > 600) return true;
@@ -78,7 +67,7 @@ TEST(RegionProcess, CuttingConnectionsAHundredTimesChangesNoBit) {
 }
 
 TEST(RegionProcess, StoppedForTwoSecondsMakesTheOthersWaitAndSaySo) {
-  const RunOptions options = OptionsFor("demo.json", 250);
+  const RunOptions options = OptionsFor("demo.json", 250, 50);
   constexpr RegionId kStopped = 1;
   enum { kBefore, kStoppedNow, kAfter } phase = kBefore;
   steady_clock::time_point stopped_at;
@@ -131,7 +120,7 @@ std::string Scrape(const std::string& endpoint) {
 }
 
 TEST(RegionProcess, ServesHealthMetricsAndReplicasWhileItTicks) {
-  RunOptions options = OptionsFor("demo.json", 0);
+  RunOptions options = OptionsFor("demo.json", 0, 50);
   bool looked = false;
   LocalAllocator allocator({});
   RunResult result;

@@ -1,6 +1,5 @@
 #include "server/control/kubernetes/control_process.h"
 
-#include <grpcpp/ext/proto_server_reflection_plugin.h>
 #include <grpcpp/grpcpp.h>
 #include <unistd.h>
 
@@ -15,6 +14,7 @@
 #include <absl/synchronization/mutex.h>
 
 #include "server/control/control_hub.h"
+#include "server/control/control_port.h"
 #include "server/control/interrupts.h"
 #include "server/control/kubernetes/api_client.h"
 #include "server/control/kubernetes/cluster_access.h"
@@ -33,7 +33,6 @@ using Clock = std::chrono::steady_clock;
 
 constexpr milliseconds kLookEvery{100};  // for signals; what happens wakes us
 constexpr seconds kLabelEvery{10};
-constexpr int kLeastPingMs = 2000;  // region servers ask whether we are there every 5 s
 
 void Log(const std::string& what) { std::cerr << "[control] " << what << std::endl; }
 
@@ -49,11 +48,8 @@ class ControlProcess {
     if (!security.ok()) return security.status();
     security_ = *std::move(security);
     if (absl::Status s = security_->CheckListen(options_.listen, false); !s.ok()) return s;
-    grpc::EnableDefaultHealthCheckService(true);
-    grpc::reflection::InitProtoReflectionServerBuilderPlugin();
     grpc::ServerBuilder builder;
-    builder.AddChannelArgument(GRPC_ARG_ALLOW_REUSEPORT, 0);
-    builder.AddChannelArgument(GRPC_ARG_HTTP2_MIN_RECV_PING_INTERVAL_WITHOUT_DATA_MS, kLeastPingMs);
+    ConfigureControlPort(&builder);
     int port = 0;
     security_->Listen(&builder, options_.listen, &port);
     security_->guard().Register(&builder, v1::Control::service_full_name(), &hub_);
