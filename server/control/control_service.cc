@@ -92,6 +92,8 @@ ControlService::ControlService(RunPlan plan)
     RegionStatus& status = regions_[i].status;
     status.incarnation = from.incarnation;
     status.was_ready = from.was_ready;
+    status.ready_incarnation = from.ready_incarnation;
+    status.keeper = from.keeper;
     status.endpoint = from.endpoint;
     status.member = from.member;
     regions_[i].joins = from.joins;
@@ -273,6 +275,7 @@ absl::Status ControlService::HandleRunning(const RegionRecord& record, const v1:
 void ControlService::Resume(RegionId region, const v1::Running& running) {
   RegionRecord& record = regions_[region];
   record.assigned = record.status.ready = record.status.was_ready = true;
+  record.status.ready_incarnation = running.incarnation();
   record.status.report.set_tick(running.tick());
   record.status.report.set_bodies(running.bodies());
   for (size_t i = 0; i < regions_.size(); ++i) {
@@ -312,6 +315,10 @@ void ControlService::Assign(RegionId region) {
   a->set_incarnation(to.status.incarnation);
   a->set_checkpoint_every(plan_.checkpoint_every);
   a->set_recover(to.status.was_ready);
+  a->set_ready_incarnation(to.status.ready_incarnation);
+  a->set_keeper(to.status.keeper);
+  a->set_volume_from(to.status.report.volume_from());
+  a->set_copy_from(to.status.report.copy_from());
   a->set_undivided(plan_.undivided);
   a->set_no_real_time(plan_.no_real_time);
   a->set_last_tick(plan_.last_tick);
@@ -335,8 +342,11 @@ void ControlService::Expect(RegionId region, uint64_t incarnation, const std::st
   status.incarnation = incarnation;
   status.joined = status.ready = status.finished = status.left = false;
   status.goodbye.clear();
+  status.fetched.clear();
   status.pid = 0;
   status.reported = std::chrono::steady_clock::now();
+  // From here on nobody listens to the one before, wherever the next one has its checkpoint from.
+  if (status.was_ready && !status.endpoint.empty()) TellMoved(region);
   Changed();
 }
 
@@ -367,7 +377,13 @@ absl::Status ControlService::HandleReady(RegionId region, const v1::Ready& ready
   }
   record->status.ready = record->status.was_ready = true;
   record->status.report.set_bodies(ready.bodies());
+  record->status.ready_incarnation = record->status.incarnation;
+  record->status.fetched = ready.fetched();
   record->status.report.set_tick(ready.tick());
+  // What it has gone on from is all that its peers keep frames for, and what it makes of it need not be what another
+  // one would make of the copy.
+  record->status.report.set_volume_from(ready.tick());
+  record->status.report.set_copy_from(ready.fetched().empty() ? ready.tick() + 1 : ready.tick());
   record->status.report.clear_waiting_for();
   if (record->status.incarnation > 1 || record->joins.has_value()) TellMoved(region);
   // Those that are to join it must know before the world hears of them.
@@ -447,6 +463,7 @@ absl::Status ControlService::HandleReport(RegionRecord* record, const v1::Report
   status.frame = Merge(record->recent);
   status.reported = now;
   status.report = report;
+  if (report.keeper() != 0) status.keeper = report.keeper();
   status.report.clear_hashes();
   status.report.clear_windows();
   status.report.clear_violation_log();

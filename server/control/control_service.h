@@ -27,9 +27,11 @@ inline constexpr uint32_t kControlProtocolVersion = 1;
 struct RunPlan {
   // What is known of a region before anything is heard of it.
   struct Region {
-    std::string token;         // what its server says; empty: none is expected yet
-    uint64_t incarnation = 1;  // of that server
-    bool was_ready = false;    // some server of it was: there is a checkpoint
+    std::string token;               // what its server says; empty: none is expected yet
+    uint64_t incarnation = 1;        // of that server
+    bool was_ready = false;          // some server of it was: there is a checkpoint
+    uint64_t ready_incarnation = 0;  // the newest that was
+    int keeper = 0;                  // as in Report
     std::string endpoint = {};
     std::optional<v1::LayoutChange> joins = std::nullopt;  // with which it joins, or has joined
     bool member = true;

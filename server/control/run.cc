@@ -91,11 +91,11 @@ class Runner {
     bool joins = false;    // none was started since the region was given its name
     bool wanted = true;
     Clock::time_point ended;
-    Tick furthest = 0;            // that any server of it had reported when it ended
-    int failures = 0;             // in a row, without getting further
-    ServerExit exit;              // when it is not alive
-    std::string storage_failure;  // as it was told of
-    bool port_lost = false;       // it could not even listen
+    Tick furthest = 0;                                   // that any server of it had reported when it ended
+    int failures = 0;                                    // in a row, without getting further
+    ServerExit exit;                                     // when it is not alive
+    std::string storage_failure, copy_failure, fetched;  // as was told of
+    bool port_lost = false;                              // it could not even listen
   };
 
   // What an earlier control plane has left.
@@ -134,6 +134,8 @@ class Runner {
       servers_[i].exit.how = "it has ended while no control plane was there";
       plan_regions_[i].incarnation = std::max<uint64_t>(1, from.incarnation());
       plan_regions_[i].was_ready = from.was_ready();
+      plan_regions_[i].ready_incarnation = from.ready_incarnation();
+      plan_regions_[i].keeper = from.keeper();
       plan_regions_[i].endpoint = from.endpoint();
       const auto r = static_cast<RegionId>(i);
       servers_[i].wanted = layout_->WantsServer(r);
@@ -347,8 +349,11 @@ class Runner {
     for (size_t i = 0; i < servers_.size(); ++i) {
       v1::RegionRecord* const to = record_.mutable_regions(static_cast<int>(i));
       const RegionStatus& from = status.regions[i];
-      changed |= to->was_ready() != from.was_ready || to->endpoint() != from.endpoint;
+      changed |= to->was_ready() != from.was_ready || to->endpoint() != from.endpoint ||
+                 to->ready_incarnation() != from.ready_incarnation || to->keeper() != from.keeper;
       to->set_was_ready(from.was_ready);
+      to->set_ready_incarnation(from.ready_incarnation);
+      to->set_keeper(from.keeper);
       to->set_endpoint(from.endpoint);
     }
     const bool starts = status.stage == Stage::kReady;
@@ -371,17 +376,25 @@ class Runner {
     return s;
   }
 
-  // A region that cannot write goes on; if it dies then, what it did since its last checkpoint may be lost.
+  // A region that cannot write goes on; if it dies then, what it did since its last checkpoint may be lost. One without
+  // a copy must not lose its volume.
   void TellOfStorage(const RunStatus& status) {
     for (size_t i = 0; i < servers_.size(); ++i) {
-      const std::string& failure = status.regions[i].report.storage_failure();
-      std::string& told = servers_[i].storage_failure;
-      if (failure.empty() != told.empty()) {
-        Tell(static_cast<RegionId>(i),
-             failure.empty() ? "is protected by checkpoints again" : "is not protected by checkpoints: " + failure);
-      }
-      told = failure;
+      const auto region = static_cast<RegionId>(i);
+      const RegionStatus& r = status.regions[i];
+      TellOfFailure(region, "checkpoints", r.report.storage_failure(), &servers_[i].storage_failure);
+      TellOfFailure(region, "a copy", r.report.copy_failure(), &servers_[i].copy_failure);
+      if (r.fetched != servers_[i].fetched && !r.fetched.empty()) Tell(region, "goes on from " + r.fetched);
+      servers_[i].fetched = r.fetched;
     }
+  }
+
+  void TellOfFailure(RegionId region, const char* by, const std::string& failure, std::string* told) const {
+    if (failure.empty() != told->empty()) {
+      Tell(region, failure.empty() ? absl::StrCat("is protected by ", by, " again")
+                                   : absl::StrCat("is not protected by ", by, ": ", failure));
+    }
+    *told = failure;
   }
 
   void Tell(RegionId region, const std::string& what) const {

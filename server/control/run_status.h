@@ -23,10 +23,13 @@ enum class Stage : uint8_t {
 struct RegionStatus {
   uint64_t incarnation = 1;  // of the server that is expected, or here
   bool joined = false, ready = false, finished = false;
-  bool was_ready = false;  // this server or an earlier one: there is a checkpoint
-  bool left = false;       // its stream has ended
-  bool member = true;      // by the layout in force, as far as is known; else it will join, or leaves, or has left
-  std::string goodbye;     // the reason it gave, if any
+  bool was_ready = false;          // this server or an earlier one: there is a checkpoint
+  uint64_t ready_incarnation = 0;  // the newest that was
+  int keeper = 0;                  // as in Report, when it last said one
+  bool left = false;               // its stream has ended
+  bool member = true;   // by the layout in force, as far as is known; else it will join, or leaves, or has left
+  std::string goodbye;  // the reason it gave, if any
+  std::string fetched;  // why and where from this server's checkpoint was fetched; empty: it was not
   std::string endpoint, metrics_endpoint;
   int64_t pid = 0;
   // The newest report, without its hashes, windows and violations. Before the first one: `bodies` of its Ready.

@@ -7,6 +7,7 @@
 #include <spdlog/spdlog.h>
 
 #include "server/physics/bullet_engine.h"
+#include "server/region/copy_fetch.h"
 #include "server/transport/input_codec.h"
 #include "server/transport/link_limits.h"
 #include "server/transport/world_spec.h"
@@ -28,8 +29,9 @@ LinkIdentity IdentityOf(const v1::Assignment& assignment, const World& world) {
 
 }  // namespace
 
-absl::StatusOr<std::unique_ptr<HostedRegion>> HostedRegion::Load(const v1::Assignment& assignment,
-                                                                 const std::filesystem::path& data) {
+absl::StatusOr<std::unique_ptr<HostedRegion>> HostedRegion::Load(
+    const v1::Assignment& assignment, const std::filesystem::path& data,
+    const std::shared_ptr<grpc::ChannelCredentials>& credentials) {
   absl::StatusOr<World> world = WorldFromSpec(assignment.world());
   if (!world.ok()) return world.status();
   if (assignment.undivided()) {
@@ -65,24 +67,62 @@ absl::StatusOr<std::unique_ptr<HostedRegion>> HostedRegion::Load(const v1::Assig
     return absl::InvalidArgumentError("assignment.recover: needs checkpoints; set assignment.checkpoint_every");
   }
   std::unique_ptr<HostedRegion> out(new HostedRegion(assignment, *std::move(world)));
-  if (absl::Status s = out->LoadRegion(data); !s.ok()) return s;
+  if (absl::Status s = out->LoadRegion(data, credentials); !s.ok()) return s;
   return out;
 }
 
 HostedRegion::HostedRegion(const v1::Assignment& assignment, World world)
     : assignment_(assignment), world_(std::move(world)) {}
 
-absl::Status HostedRegion::LoadRegion(const std::filesystem::path& data) {
+// From its own volume, or else from the keeper.
+absl::StatusOr<Journal::Recovered> HostedRegion::Find(const Credentials& credentials) {
+  const CopyIdentity identity{WorldHash(assignment_.world()), assignment_.region(), assignment_.incarnation()};
+  absl::StatusOr<Journal::Recovered> own = journal_->Recover(
+      identity.world_hash, identity.region, {assignment_.ready_incarnation(), assignment_.volume_from()});
+  if (own.ok() || absl::IsAborted(own.status())) return own;
+  const RegionId keeper = assignment_.keeper() - 1;
+  const std::string why(own.status().message());
+  if (keeper < 0 || keeper >= assignment_.endpoints_size()) {
+    return absl::Status(own.status().code(), absl::StrCat(why, "; and there is no copy yet"));
+  }
+  spdlog::warn("no checkpoint here: {}; asks region {} for its copy", why, keeper);
+  absl::StatusOr<Journal::Recovered> copy =
+      FetchCopy(identity, keeper, assignment_.endpoints(keeper), credentials, kLongestFetch);
+  if (copy.ok() && copy->checkpoint.tick < assignment_.copy_from()) {
+    copy = absl::FailedPreconditionError(absl::StrCat("it is of tick ", copy->checkpoint.tick,
+                                                      ", and what it lacks is as late as ", assignment_.copy_from(),
+                                                      ": the region was not protected by a copy"));
+  }
+  absl::Status s = copy.status();
+  if (s.ok()) s = journal_->Adopt(*copy);
+  if (!s.ok()) {
+    return absl::DataLossError(absl::StrCat("no checkpoint to go on from: ", why, "; and no copy at region ", keeper,
+                                            ": ", std::string(s.message())));
+  }
+  fetched_ = absl::StrCat("the copy at region ", keeper, ", of tick ", copy->checkpoint.tick, ", because ", why);
+  return copy;
+}
+
+absl::Status HostedRegion::LoadRegion(const std::filesystem::path& data, const Credentials& credentials) {
   const bool keep = assignment_.checkpoint_every() > 0;
   if (keep) {
     absl::StatusOr<std::unique_ptr<Journal>> journal = Journal::Open(data, assignment_.incarnation());
     if (!journal.ok()) return journal.status();
     journal_ = *std::move(journal);
   }
-  absl::Status s = assignment_.recover() ? Recover() : absl::NotFoundError("a first life");
+  absl::Status s = assignment_.recover() ? Recover(credentials) : absl::NotFoundError("a first life");
   const bool joins = assignment_.has_join() && absl::IsNotFound(s);
   if (!assignment_.recover() || joins) s = MakeRegion();
   if (!s.ok()) return s;
+  if (keep) {
+    // What is at the keeper may have inputs that the own log has not, or lack some that it has, which were told to
+    // nobody before, and are now.
+    const Tick least = !recovered_ ? 0 : fetched_.empty() ? region_->tick() + 1 : region_->tick();
+    copy_ = std::make_unique<CopySender>(
+        CopyIdentity{WorldHash(assignment_.world()), assignment_.region(), assignment_.incarnation()}, least,
+        [](const std::string& what) { spdlog::info("{}", what); });
+    journal_->CopyTo(copy_.get());
+  }
   const auto log = [](RegionId peer, const std::string& what) { spdlog::info("link to region {}: {}", peer, what); };
   LinkIdentity identity = IdentityOf(assignment_, world_);
   if (!replay_.empty()) identity.log_until = replay_.back().tick;
@@ -97,8 +137,8 @@ absl::Status HostedRegion::LoadRegion(const std::filesystem::path& data) {
   return journal_->Begin(TakeCheckpoint(WorldHash(assignment_.world()), *region_, *links_));
 }
 
-absl::Status HostedRegion::Recover() {
-  absl::StatusOr<Journal::Recovered> found = journal_->Recover(WorldHash(assignment_.world()), assignment_.region());
+absl::Status HostedRegion::Recover(const Credentials& credentials) {
+  absl::StatusOr<Journal::Recovered> found = Find(credentials);
   if (!found.ok()) return found.status();
   absl::StatusOr<std::unique_ptr<Region>> region =
       Region::Load(world_, assignment_.region(), MakeBulletEngine(world_.environment), found->checkpoint.state);
@@ -134,6 +174,7 @@ absl::Status HostedRegion::MakeRegion() {
 
 void HostedRegion::PeerMoved(const v1::PeerMoved& moved) {
   links_->Redirect(moved.region(), moved.endpoint(), moved.incarnation());
+  if (copy_ != nullptr) copy_->Redirect(moved.region(), moved.endpoint(), moved.incarnation());
   if (moved.joins() != 0) links_->Expect(moved.region(), moved.joins());
 }
 
@@ -156,7 +197,11 @@ absl::Status HostedRegion::ChangeLayout(const v1::ChangeLayout& change) {
 HostedRegion::~HostedRegion() { Stop(); }
 
 void HostedRegion::Connect(PeerService* service, const std::shared_ptr<grpc::ChannelCredentials>& credentials) {
-  links_->Connect(service, {assignment_.endpoints().begin(), assignment_.endpoints().end()}, credentials);
+  const std::vector<std::string> endpoints(assignment_.endpoints().begin(), assignment_.endpoints().end());
+  links_->Connect(service, endpoints, credentials);
+  if (copy_ != nullptr) {
+    copy_->Connect(KeeperOf(assignment_.region(), region_->members()), endpoints, credentials);
+  }
 }
 
 void HostedRegion::Start(int64_t start_unix_us, TickLoop::Hooks hooks) {

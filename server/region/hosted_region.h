@@ -1,6 +1,7 @@
 // One assignment being served: the world, the region, its links and its tick thread.
 #pragma once
 
+#include <chrono>
 #include <filesystem>
 #include <memory>
 #include <string>
@@ -11,6 +12,7 @@
 #include "aureole/v1/control.pb.h"
 #include "server/core/region.h"
 #include "server/core/world.h"
+#include "server/region/copy_sender.h"
 #include "server/region/journal.h"
 #include "server/region/region_links.h"
 #include "server/region/tick_loop.h"
@@ -19,12 +21,15 @@ namespace aureole {
 
 class HostedRegion {
  public:
-  // Loads the world and the region's share of it, or, when the assignment says `recover`, what the journal has of it;
-  // one that is to join a world that runs, and has not done so yet, is empty. `data`: directory for the journal; needed
-  // when the assignment asks for checkpoints. InvalidArgument when the assignment makes no sense, else the journal's
-  // errors.
-  static absl::StatusOr<std::unique_ptr<HostedRegion>> Load(const v1::Assignment& assignment,
-                                                            const std::filesystem::path& data);
+  // Loads the world and the region's share of it, or, when the assignment says `recover`, what the journal has of it,
+  // or else the region's keeper, which `credentials` are for; one that is to join a world that runs, and has not done
+  // so yet, is empty. `data`: directory for the journal; needed when the assignment asks for checkpoints.
+  // InvalidArgument when the assignment makes no sense, else the journal's errors, or DataLoss with those of the
+  // keeper. Waits for the keeper, at most kLongestFetch.
+  static absl::StatusOr<std::unique_ptr<HostedRegion>> Load(
+      const v1::Assignment& assignment, const std::filesystem::path& data,
+      const std::shared_ptr<grpc::ChannelCredentials>& credentials);
+  static constexpr std::chrono::seconds kLongestFetch{8};
   // Stops and joins the tick thread, and closes the links.
   ~HostedRegion();
 
@@ -32,6 +37,8 @@ class HostedRegion {
   const Region& region() const { return *region_; }
   RegionLinks& links() { return *links_; }
   const v1::Assignment& assignment() const { return assignment_; }
+  // Why and where from the checkpoint was fetched; empty: it was not.
+  const std::string& fetched() const { return fetched_; }
 
   // Accepts and dials the peers.
   void Connect(PeerService* service, const std::shared_ptr<grpc::ChannelCredentials>& credentials);
@@ -55,14 +62,19 @@ class HostedRegion {
 
  private:
   HostedRegion(const v1::Assignment& assignment, World world);
-  absl::Status LoadRegion(const std::filesystem::path& data);
-  absl::Status Recover();
+  using Credentials = std::shared_ptr<grpc::ChannelCredentials>;
+
+  absl::Status LoadRegion(const std::filesystem::path& data, const Credentials& credentials);
+  absl::Status Recover(const Credentials& credentials);
+  absl::StatusOr<Journal::Recovered> Find(const Credentials& credentials);
   absl::Status MakeRegion();
 
   const v1::Assignment assignment_;
   const World world_;
-  std::unique_ptr<Journal> journal_;  // null: no checkpoints
+  std::unique_ptr<CopySender> copy_;  // null: no checkpoints
+  std::unique_ptr<Journal> journal_;  // as well
   bool recovered_ = false;            // from a checkpoint
+  std::string fetched_;
   std::map<RegionId, LinkState> link_states_;
   std::vector<LoggedInput> replay_;
   std::vector<Checkpoint::Hash> hashes_;

@@ -8,6 +8,7 @@
 #include <chrono>
 #include <cstring>
 #include <fstream>
+#include <iterator>
 #include <system_error>
 
 #include <absl/strings/match.h>
@@ -68,13 +69,13 @@ absl::StatusOr<std::string> ReadAll(const std::filesystem::path& path) {
 }
 
 // A record: size and check sum of what follows; tick, input.
-std::string RecordOf(Tick n, const Input& input) {
-  std::string body, out;
+void AppendRecord(Tick n, const Input& input, std::string* out) {
+  std::string body;
   Writer writer(&body);
   writer(n, input);
-  Writer head(&out);
+  Writer head(out);
   head(static_cast<uint32_t>(body.size()), CheckSum(body));
-  return out + body;
+  out->append(body);
 }
 
 // The records of a file, in order. A torn one at the end was never told to anybody; in the last file, which may not
@@ -101,15 +102,31 @@ absl::Status ReadRecords(std::string_view bytes, bool last, std::vector<LoggedIn
 
 }  // namespace
 
-Journal::Journal(std::filesystem::path root, uint64_t incarnation)
-    : root_(std::move(root)), directory_(root_ / absl::StrCat("i", incarnation)), incarnation_(incarnation) {}
+std::string EncodeInputs(const std::vector<LoggedInput>& inputs) {
+  std::string out;
+  for (const LoggedInput& l : inputs) AppendRecord(l.tick, l.input, &out);
+  return out;
+}
 
-absl::StatusOr<std::unique_ptr<Journal>> Journal::Open(const std::filesystem::path& directory, uint64_t incarnation) {
+absl::StatusOr<std::vector<LoggedInput>> DecodeInputs(std::string_view bytes) {
+  std::vector<LoggedInput> out;
+  if (absl::Status s = ReadRecords(bytes, false, &out); !s.ok()) return s;
+  return out;
+}
+
+Journal::Journal(std::filesystem::path root, uint64_t incarnation, std::function<void(const Stats&)> changed)
+    : root_(std::move(root)),
+      directory_(root_ / absl::StrCat("i", incarnation)),
+      incarnation_(incarnation),
+      told_(std::move(changed)) {}
+
+absl::StatusOr<std::unique_ptr<Journal>> Journal::Open(const std::filesystem::path& directory, uint64_t incarnation,
+                                                       std::function<void(const Stats&)> changed) {
   std::error_code error;
   std::filesystem::create_directories(directory, error);
   if (error) return absl::UnavailableError(absl::StrCat("cannot make ", directory.string(), ": ", error.message()));
   if (absl::Status s = WriteAtomically(directory / "writable", ""); !s.ok()) return s;
-  std::unique_ptr<Journal> out(new Journal(directory, incarnation));
+  std::unique_ptr<Journal> out(new Journal(directory, incarnation, std::move(changed)));
   Journal* const j = out.get();
   j->checkpoint_thread_ = std::thread([j] { j->WriteCheckpoints(); });
   j->log_thread_ = std::thread([j] { j->WriteLog(); });
@@ -149,21 +166,26 @@ bool Journal::TakenOver() const {
   return !all.empty() && all.rbegin()->first > incarnation_;
 }
 
-absl::Status Journal::TakeOver() {
+absl::Status Journal::TakeOver(uint64_t least) {
   const std::map<uint64_t, std::filesystem::path> all = Incarnations();
   if (all.empty()) return absl::NotFoundError(absl::StrCat("no ", (root_ / "iN" / kCheckpoint).string()));
   const auto& [newest, path] = *all.rbegin();
-  if (newest >= incarnation_) {
-    return absl::AbortedError(
-        absl::StrCat(path.string(), " is not of an earlier incarnation than this, ", incarnation_));
+  if (newest > incarnation_) {
+    return absl::AbortedError(absl::StrCat(path.string(), " is of a later incarnation than this, ", incarnation_));
   }
+  if (newest < least) {
+    return absl::FailedPreconditionError(
+        absl::StrCat(path.string(), " is stale: incarnation ", least, " has gone on elsewhere"));
+  }
+  if (newest == incarnation_) return absl::OkStatus();
   if (std::rename(path.c_str(), directory_.c_str()) != 0) return FileError("rename", path);
   return SyncDirectory(root_);
 }
 
-// The segments of the latest incarnation that has any hold all that is needed. They are put together in one of this
-// incarnation, since a fenced one may still write to those it has open.
-absl::Status Journal::ReadLog(Recovered* out) const {
+// The segments of the latest incarnation that has any hold all that is needed; a later one replaces what those before
+// it have of its ticks. They are put together in one of this incarnation, since a fenced one may still write to those
+// it has open.
+absl::Status Journal::ReadLog(Recovered* out) {
   std::map<uint64_t, std::map<int64_t, std::filesystem::path>> found;
   std::error_code error;
   for (const auto& entry : std::filesystem::directory_iterator(directory_, error)) {
@@ -182,27 +204,38 @@ absl::Status Journal::ReadLog(Recovered* out) const {
   for (const auto& [number, path] : files) {
     const absl::StatusOr<std::string> records = ReadAll(path);
     if (!records.ok()) return records.status();
-    if (absl::Status s = ReadRecords(*records, number == files.rbegin()->first, &out->inputs); !s.ok()) {
+    std::vector<LoggedInput> inputs;
+    if (absl::Status s = ReadRecords(*records, number == files.rbegin()->first, &inputs); !s.ok()) {
       return absl::DataLossError(absl::StrCat(path.string(), ": ", std::string(s.message())));
     }
+    if (inputs.empty()) continue;
+    const Tick first = inputs.front().tick;
+    std::erase_if(out->inputs, [first](const LoggedInput& l) { return l.tick >= first; });
+    std::move(inputs.begin(), inputs.end(), std::back_inserter(out->inputs));
   }
   std::erase_if(out->inputs, [out](const LoggedInput& l) { return l.tick <= out->checkpoint.tick; });
-  std::string all;
-  for (const LoggedInput& l : out->inputs) all += RecordOf(l.tick, l.input);
-  if (absl::Status s = WriteAtomically(SegmentFile(0), all); !s.ok()) return s;
+  if (absl::Status s = WriteAtomically(SegmentFile(0), EncodeInputs(out->inputs)); !s.ok()) return s;
   for (const auto& [incarnation, old] : found) {
-    if (incarnation == incarnation_) continue;
-    for (const auto& [number, path] : old) std::filesystem::remove(path, error);
+    for (const auto& [number, path] : old) {
+      if (path != SegmentFile(0)) std::filesystem::remove(path, error);
+    }
   }
   return absl::OkStatus();
+}
+
+// Its inputs are those of segment 0.
+void Journal::GoOnAfter(const Recovered& found) {
+  const std::lock_guard lock(mutex_);
+  if (!found.inputs.empty()) segments_.push_back({SegmentFile(0), found.inputs.back().tick});
+  next_segment_ = 1;
 }
 
 std::filesystem::path Journal::SegmentFile(int64_t number) const {
   return directory_ / absl::StrCat(kLog, "-", incarnation_, "-", number);
 }
 
-absl::StatusOr<Journal::Recovered> Journal::Recover(uint64_t world_hash, RegionId region) {
-  if (absl::Status s = TakeOver(); !s.ok()) return s;
+absl::StatusOr<Journal::Recovered> Journal::Recover(uint64_t world_hash, RegionId region, const Least& least) {
+  if (absl::Status s = TakeOver(least.incarnation); !s.ok()) return s;
   const absl::StatusOr<std::string> bytes = ReadAll(directory_ / kCheckpoint);
   if (!bytes.ok()) return bytes.status();
   absl::StatusOr<Checkpoint> checkpoint = DecodeCheckpoint(*bytes);
@@ -215,12 +248,27 @@ absl::StatusOr<Journal::Recovered> Journal::Recover(uint64_t world_hash, RegionI
         "%s is of region %d of world %016x, not of region %d of world %016x", (directory_ / kCheckpoint).string(),
         checkpoint->region, checkpoint->world_hash, region, world_hash));
   }
+  if (checkpoint->tick < least.tick) {
+    return absl::FailedPreconditionError(absl::StrCat((directory_ / kCheckpoint).string(), " is of tick ",
+                                                      checkpoint->tick, ", and what was not logged here is as late as ",
+                                                      least.tick));
+  }
   Recovered out{*std::move(checkpoint), {}};
   if (absl::Status s = ReadLog(&out); !s.ok()) return s;
-  const std::lock_guard lock(mutex_);
-  if (!out.inputs.empty()) segments_.push_back({SegmentFile(0), out.inputs.back().tick});
-  next_segment_ = 1;
+  GoOnAfter(out);
   return out;
+}
+
+absl::Status Journal::Continue() {
+  Recovered log;  // all of it: the checkpoint is not looked at
+  absl::Status s = TakeOver(0);
+  if (s.ok()) s = ReadLog(&log);
+  if (absl::IsNotFound(s) || absl::IsDataLoss(s)) {
+    log.inputs.clear();
+    s = Renew();
+  }
+  if (s.ok()) GoOnAfter(log);
+  return s;
 }
 
 absl::Status Journal::Clear() {
@@ -234,30 +282,47 @@ absl::Status Journal::Clear() {
   return SyncDirectory(root_);
 }
 
-absl::Status Journal::Begin(const Checkpoint& first) {
+// An empty directory of this incarnation, and no other.
+absl::Status Journal::Renew() {
   if (absl::Status s = Clear(); !s.ok()) return s;
   std::error_code error;
   if (!std::filesystem::create_directory(directory_, error)) {
     return absl::UnavailableError(absl::StrCat("cannot make ", directory_.string(), ": ", error.message()));
   }
-  if (absl::Status s = SyncDirectory(root_); !s.ok()) return s;
-  size_t bytes = 0;
-  return Store(first, &bytes);
+  return SyncDirectory(root_);
 }
 
-absl::Status Journal::Store(const Checkpoint& checkpoint, size_t* bytes) const {
-  const std::string encoded = EncodeCheckpoint(checkpoint);
-  *bytes = encoded.size();
+absl::Status Journal::Begin(const Checkpoint& first) {
+  if (absl::Status s = Renew(); !s.ok()) return s;
+  return Store(EncodeCheckpoint(first));
+}
+
+// The checkpoint comes last: without it, nothing is here.
+absl::Status Journal::Adopt(const Recovered& found) {
+  if (absl::Status s = Renew(); !s.ok()) return s;
+  if (absl::Status s = WriteAtomically(SegmentFile(0), EncodeInputs(found.inputs)); !s.ok()) return s;
+  GoOnAfter(found);
+  return Store(EncodeCheckpoint(found.checkpoint));
+}
+
+void Journal::CopyTo(CopySender* copy) { copy_ = copy; }
+
+absl::Status Journal::Store(const std::string& encoded) const {
   return WriteAtomically(directory_ / kCheckpoint, encoded);
 }
 
 void Journal::Log(Tick n, const std::vector<Input>& inputs) {
   std::string records;
-  for (const Input& input : inputs) records += RecordOf(n, input);
+  for (const Input& input : inputs) AppendRecord(n, input, &records);
+  if (copy_ != nullptr) copy_->Log(n, records);
+  LogRecords(n, std::move(records));
+}
+
+void Journal::LogRecords(Tick n, std::string records) {
   {
     const std::lock_guard lock(mutex_);
     if (std::exchange(new_segment_, false)) segments_.push_back({});
-    segments_.back().last = n;
+    segments_.back().last = logged_tick_ = n;
     records_ += records;
     ++logged_;
   }
@@ -265,9 +330,14 @@ void Journal::Log(Tick n, const std::vector<Input>& inputs) {
 }
 
 absl::Status Journal::AwaitLogged() {
-  std::unique_lock lock(mutex_);
-  changed_.wait(lock, [this] { return logged_durable_ == logged_; });
-  return std::exchange(log_status_, absl::OkStatus());
+  absl::Status out;
+  {
+    std::unique_lock lock(mutex_);
+    changed_.wait(lock, [this] { return logged_durable_ == logged_; });
+    out = std::exchange(log_status_, absl::OkStatus());
+  }
+  if (copy_ != nullptr) copy_->AwaitLogged();
+  return out;
 }
 
 void Journal::WriteLog() {
@@ -276,6 +346,7 @@ void Journal::WriteLog() {
     changed_.wait(lock, [this] { return stopped_ || logged_durable_ != logged_; });
     if (logged_durable_ == logged_) return;
     const uint64_t upto = logged_;
+    const Tick tick = logged_tick_;
     const std::string records = std::exchange(records_, {});
     const bool begin = segments_.back().path.empty();
     if (begin) segments_.back().path = SegmentFile(next_segment_++);
@@ -290,17 +361,35 @@ void Journal::WriteLog() {
     if (s.ok()) s = WriteAll(log_file_, records, path);
     if (s.ok() && fdatasync(log_file_) != 0) s = FileError("sync", path);
     const bool taken_over = TakenOver();
-    if (taken_over) s = absl::AbortedError(absl::StrCat(root_.string(), " was taken over by a later incarnation"));
+    std::error_code error;
+    if (taken_over) {
+      s = absl::AbortedError(absl::StrCat(root_.string(), " was taken over by a later incarnation"));
+    } else if (s.ok() && !std::filesystem::exists(path, error)) {
+      s = absl::UnavailableError(absl::StrCat(path.string(), " is gone"));
+    }
     lock.lock();
     logged_durable_ = upto;
     fenced_ |= taken_over;
-    if (!s.ok()) {
+    if (s.ok()) {
+      stats_.logged_tick = tick;
+    } else {
       log_status_ = s;
+      stats_.least_tick = tick;
       Failed(s);
       new_segment_ = true;  // what is torn stays at the end of its file
     }
-    changed_.notify_all();
+    Changed(&lock);
   }
+}
+
+// Gives the mutex away for a moment.
+void Journal::Changed(std::unique_lock<std::mutex>* lock) {
+  changed_.notify_all();
+  if (told_ == nullptr) return;
+  const Stats stats = stats_;
+  lock->unlock();
+  told_(stats);
+  lock->lock();
 }
 
 bool Journal::writing() const {
@@ -308,12 +397,28 @@ bool Journal::writing() const {
   return writing_;
 }
 
-void Journal::Write(Checkpoint checkpoint) {
+void Journal::Write(Checkpoint checkpoint, RegionId keeper) {
+  if (copy_ != nullptr) copy_->Begin(checkpoint.tick, keeper);
+  ToWrite next;
+  next.tick = checkpoint.tick;
+  next.used.emplace();
+  for (const auto& [peer, link] : checkpoint.links) (*next.used)[peer] = {link.epoch, link.applied};
+  next.checkpoint = std::move(checkpoint);
+  WriteNext(std::move(next));
+}
+
+void Journal::WriteEncoded(Tick tick, std::string checkpoint) {
+  ToWrite next;
+  next.tick = tick;
+  next.encoded = std::make_shared<const std::string>(std::move(checkpoint));
+  WriteNext(std::move(next));
+}
+
+void Journal::WriteNext(ToWrite next) {
   {
     const std::lock_guard lock(mutex_);
-    AUREOLE_CHECK(!writing_, "checkpoint of tick %lld while another is written",
-                  static_cast<long long>(checkpoint.tick));
-    to_write_ = std::move(checkpoint);
+    AUREOLE_CHECK(!writing_, "checkpoint of tick %lld while another is written", static_cast<long long>(next.tick));
+    to_write_ = std::move(next);
     writing_ = true;
     new_segment_ = true;  // so that whole files are covered by it
   }
@@ -325,29 +430,32 @@ void Journal::WriteCheckpoints() {
   for (;;) {
     changed_.wait(lock, [this] { return stopped_ || to_write_.has_value(); });
     if (!to_write_.has_value()) return;
-    const Checkpoint checkpoint = *std::exchange(to_write_, std::nullopt);
+    ToWrite next = *std::exchange(to_write_, std::nullopt);
     lock.unlock();
     const auto began = std::chrono::steady_clock::now();
-    size_t bytes = 0;
-    const absl::Status s = Store(checkpoint, &bytes);
+    if (next.checkpoint.has_value()) {
+      next.encoded = std::make_shared<const std::string>(EncodeCheckpoint(*next.checkpoint));
+      next.checkpoint.reset();
+      if (copy_ != nullptr) copy_->Ship(next.tick, next.encoded);
+    }
+    const absl::Status s = Store(*next.encoded);
     const double ms = std::chrono::duration<double, std::milli>(std::chrono::steady_clock::now() - began).count();
     lock.lock();
     writing_ = false;
     if (s.ok()) {
-      stats_.durable_tick = checkpoint.tick;
+      stats_.durable_tick = next.tick;
       ++stats_.checkpoints;
-      stats_.bytes = static_cast<int64_t>(bytes);
+      stats_.bytes = static_cast<int64_t>(next.encoded->size());
       stats_.write_ms = ms;
       stats_.last_failure.clear();
-      Used used;
-      for (const auto& [peer, link] : checkpoint.links) used[peer] = {link.epoch, link.applied};
-      durable_ = std::move(used);
-      DropSegments(checkpoint.tick);
+      if (next.used.has_value()) durable_.emplace_back(next.tick, *std::move(next.used));
+      DropSegments(next.tick);
     } else {
       fenced_ |= TakenOver();
       Failed(s);
     }
-    changed_.notify_all();
+    next.encoded.reset();
+    Changed(&lock);
   }
 }
 
@@ -358,6 +466,7 @@ void Journal::Failed(const absl::Status& s) {
 }
 
 bool Journal::fenced() const {
+  if (copy_ != nullptr && copy_->fenced()) return true;
   const std::lock_guard lock(mutex_);
   return fenced_;
 }
@@ -373,12 +482,26 @@ void Journal::DropSegments(Tick durable) {
 
 std::optional<Journal::Used> Journal::TakeDurable() {
   const std::lock_guard lock(mutex_);
-  return std::exchange(durable_, std::nullopt);
+  std::optional<Used> out;
+  if (durable_.empty()) return out;
+  const Tick newest = durable_.back().first;
+  const Tick most = copy_ != nullptr ? copy_->MostToForget(newest) : newest;
+  for (; !durable_.empty() && durable_.front().first <= most; durable_.pop_front()) {
+    out = std::move(durable_.front().second);
+  }
+  return out;
+}
+
+bool Journal::durable(Tick tick) const {
+  const Stats all = stats();
+  return all.durable_tick >= tick && (!all.copy.covers || all.copy.tick >= tick);
 }
 
 Journal::Stats Journal::stats() const {
   const std::lock_guard lock(mutex_);
-  return stats_;
+  Stats out = stats_;
+  if (copy_ != nullptr) out.copy = copy_->stats();
+  return out;
 }
 
 }  // namespace aureole

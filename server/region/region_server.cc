@@ -6,6 +6,7 @@
 
 #include <atomic>
 #include <chrono>
+#include <filesystem>
 #include <memory>
 #include <mutex>
 #include <optional>
@@ -20,6 +21,7 @@
 #include <spdlog/spdlog.h>
 
 #include "server/region/control_stream.h"
+#include "server/region/copy_keeper.h"
 #include "server/region/hosted_region.h"
 #include "server/region/metrics.h"
 #include "server/transport/peer_service.h"
@@ -112,6 +114,7 @@ struct Process {
   SimulationService simulation;
   RecordingService recording;
   std::string data;
+  std::unique_ptr<CopyKeeper> copies;
   std::unique_ptr<GrpcServer> server;
   std::string control_address, world;
   v1::Hello hello;
@@ -258,7 +261,7 @@ absl::Status Process::Handle(const v1::ToRegion& message) {
       if (peer.empty()) continue;
       if (absl::Status s = security->CheckDial(peer); !s.ok()) return s;
     }
-    absl::StatusOr<std::unique_ptr<HostedRegion>> loaded = HostedRegion::Load(assignment, data);
+    absl::StatusOr<std::unique_ptr<HostedRegion>> loaded = HostedRegion::Load(assignment, data, security->channel());
     if (!loaded.ok()) return loaded.status();
     hosted = *std::move(loaded);
     spdlog::info("region {} of {}, world {}, {} bodies, k = {}, tick {} us, layout epoch {}, last tick {}, {}",
@@ -268,10 +271,12 @@ absl::Status Process::Handle(const v1::ToRegion& message) {
                  assignment.no_real_time() ? "as fast as it can" : "in real time");
     if (metrics != nullptr) metrics->Assigned(hosted->world().name, assignment.region());
     security->guard().ServeWorld(hosted->world().name);
+    copies->Serve(WorldHash(assignment.world()), assignment.region());
     hosted->Connect(&peers, security->channel());
     v1::FromRegion ready;
     ready.mutable_ready()->set_bodies(hosted->region().engine().Counts().bodies);
     ready.mutable_ready()->set_tick(hosted->region().tick());
+    ready.mutable_ready()->set_fetched(hosted->fetched());
     control->Send(std::move(ready));
   } else if (message.has_start()) {
     if (hosted == nullptr) return absl::FailedPreconditionError("a start without an assignment");
@@ -370,6 +375,8 @@ void BlockSignals() {
 int RunRegionServer(const RegionServerOptions& options) {
   Process process;
   process.data = options.data;
+  process.copies =
+      std::make_unique<CopyKeeper>(options.data.empty() ? "" : std::filesystem::path(options.data) / "copies");
   absl::StatusOr<std::unique_ptr<Security>> security = OpenSecurity(options);
   if (!security.ok()) {
     spdlog::error("{}", std::string(security.status().message()));
@@ -387,6 +394,7 @@ int RunRegionServer(const RegionServerOptions& options) {
   }
   process.server = GrpcServer::Listen(options.listen, process.security.get(),
                                       {{v1::Peer::service_full_name(), &process.peers},
+                                       {v1::Copies::service_full_name(), process.copies.get()},
                                        {v1::Simulation::service_full_name(), &process.simulation},
                                        {v1::Recording::service_full_name(), &process.recording}});
   if (process.server == nullptr) {

@@ -118,7 +118,7 @@ void TickLoop::Leave() {
   hooks_.log(absl::StrCat("left after tick ", region_->tick()));
   links_->Part();
   while (!stopped_) {
-    const bool durable = journal_ == nullptr || journal_->stats().durable_tick >= region_->tick();
+    const bool durable = journal_ == nullptr || journal_->durable(region_->tick());
     if (journal_ != nullptr) TellDurable();
     if (journal_ != nullptr && journal_->fenced()) return hooks_.fenced();
     if (durable && links_->released()) return hooks_.gone();
@@ -185,6 +185,8 @@ void TickLoop::OfferInputs() {
     if (absl::Status s = journal_->AwaitLogged(); !s.ok()) {
       hooks_.log(absl::StrCat("inputs of tick ", n, " are not durable: ", std::string(s.message())));
     }
+    // Heard before it is told: until there is a copy again, the one that may be there does not have it.
+    if (journal_->stats().copy.alone && !alone_said_) Report({}, false);
     for (const Input& input : logged_) Submit(input);
     logged_.clear();
   }
@@ -223,7 +225,7 @@ void TickLoop::Checkpoint(Tick after) {
   aureole::Checkpoint checkpoint = TakeCheckpoint(options_.world_hash, *region_, *links_);
   const size_t kept = std::min(recent_hashes_.size(), kCheckpointHashes);
   checkpoint.hashes.assign(recent_hashes_.end() - static_cast<std::ptrdiff_t>(kept), recent_hashes_.end());
-  journal_->Write(std::move(checkpoint));
+  journal_->Write(std::move(checkpoint), KeeperOf(region_->self(), region_->members()));
   checkpointed_ = region_->tick();
   longest_pause_ = std::max(longest_pause_, Clock::now() - since);
 }
@@ -412,6 +414,13 @@ void TickLoop::Report(const std::vector<RegionId>& waiting_for, bool finished) {
     r.set_checkpoint_pause_ms(Ms(longest_pause_));
     r.set_storage_failures(journal.failures);
     r.set_storage_failure(journal.last_failure);
+    r.set_volume_from(journal.least_tick);
+    r.set_keeper(journal.copy.tick > 0 ? journal.copy.keeper + 1 : 0);
+    r.set_copied_tick(journal.copy.tick);
+    r.set_copy_failures(journal.copy.failures);
+    r.set_copy_failure(journal.copy.failure);
+    r.set_copy_from(journal.copy.least_tick);
+    alone_said_ = journal.copy.alone;
   }
   said_tick_ = r.tick();
   said_bodies_ = r.bodies();

@@ -116,6 +116,7 @@ class TickLoop {
   bool replaying_ = false;     // repeats what an earlier incarnation did
   size_t replayed_ = 0;        // of options_.replay
   std::vector<Input> logged_;  // being made durable, for the next tick
+  bool alone_said_ = false;    // inputs that were told are not in the copy
   Tick checkpointed_ = 0;
   Tick log_until_ = 0;           // of all regions that were loaded with this one
   uint64_t followed_epoch_ = 0;  // 0: none yet

@@ -146,6 +146,8 @@ const std::map<std::string, Access>& MethodAccess() {
   constexpr Access kSpawn{false, v1::Token::SPAWN}, kOperate{false, v1::Token::OPERATE};
   static const std::map<std::string, Access> table = {
       {"aureole.v1.Peer.Link", kServers},
+      {"aureole.v1.Copies.Keep", kServers},
+      {"aureole.v1.Copies.Fetch", kServers},
       {"aureole.v1.Control.Join", kServers},
       {"aureole.v1.Simulation.GetWorld", kWatch},
       {"aureole.v1.Simulation.StreamReplicas", kWatch},

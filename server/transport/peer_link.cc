@@ -4,12 +4,11 @@
 
 #include <absl/strings/str_cat.h>
 #include <absl/strings/str_format.h>
-#include <grpcpp/create_channel.h>
 
 #include "server/core/check.h"
 #include "server/transport/frame_codec.h"
 #include "server/transport/link_limits.h"
-#include "server/transport/server_certificate.h"
+#include "server/transport/peer_channel.h"
 
 namespace aureole {
 namespace {
@@ -111,16 +110,7 @@ void PeerLink::Dial(const std::string& endpoint, const std::shared_ptr<grpc::Cha
 // Holds the mutex.
 void PeerLink::OpenChannel(const std::string& endpoint) {
   endpoint_ = endpoint;
-  grpc::ChannelArguments arguments;
-  arguments.SetInt(GRPC_ARG_ENABLE_HTTP_PROXY, 0);
-  arguments.SetSslTargetNameOverride(kServerName);
-  arguments.SetInt(GRPC_ARG_INITIAL_RECONNECT_BACKOFF_MS, kMinBackoffMs);
-  arguments.SetInt(GRPC_ARG_MIN_RECONNECT_BACKOFF_MS, kMinBackoffMs);
-  arguments.SetInt(GRPC_ARG_MAX_RECONNECT_BACKOFF_MS, kMaxBackoffMs);
-  arguments.SetInt(GRPC_ARG_KEEPALIVE_TIME_MS, kKeepaliveSeconds * 1000);
-  arguments.SetInt(GRPC_ARG_KEEPALIVE_TIMEOUT_MS, kKeepaliveTimeoutSeconds * 1000);
-  arguments.SetMaxReceiveMessageSize(kMaxMessageBytes);
-  channel_ = grpc::CreateCustomChannel(endpoint, credentials_, arguments);
+  channel_ = PeerChannel(endpoint, credentials_);
   stub_ = v1::Peer::NewStub(channel_);
 }
 

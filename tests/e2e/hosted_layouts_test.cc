@@ -216,7 +216,7 @@ class Servers {
     a.set_recover(recover);
     if (joins != nullptr) EncodeLayoutChange(*joins, a.mutable_join());
     absl::StatusOr<std::unique_ptr<HostedRegion>> hosted =
-        HostedRegion::Load(a, directory_ / ("region-" + std::to_string(r)));
+        HostedRegion::Load(a, directory_ / ("region-" + std::to_string(r)), grpc::InsecureChannelCredentials());
     ASSERT_TRUE(hosted.ok()) << hosted.status();
     nodes_.at(r)->hosted = *std::move(hosted);
     nodes_.at(r)->hosted->Connect(nodes_.at(r)->service.get(), grpc::InsecureChannelCredentials());

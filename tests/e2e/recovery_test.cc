@@ -3,6 +3,7 @@
 #include <signal.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <atomic>
 #include <cstdlib>
 #include <filesystem>
@@ -14,6 +15,7 @@
 #include "client/src/push_sender.h"
 #include "server/control/local_allocator.h"
 #include "server/control/run.h"
+#include "tests/e2e/destroyer.h"
 #include "tests/e2e/exact_run.h"
 #include "tests/e2e/killer.h"
 #include "tests/e2e/running_world.h"
@@ -68,6 +70,21 @@ class Recovery : public testing::Test {
     return s;
   }
 
+  // A client pushes while `trouble` looks on, until it has pushed enough; every push has acted once.
+  void ExpectPushesActOnce(int pushes, const RunObserver& trouble);
+
+  static void Damage(const fs::path& file) {
+    std::fstream out(file, std::ios::in | std::ios::out | std::ios::binary);
+    EXPECT_TRUE(out.is_open()) << file;
+    out.seekp(100);
+    out.put('\x55');
+  }
+  static bool AllHaveCopies(const RunStatus& status) {
+    return status.stage == Stage::kRunning &&
+           std::all_of(status.regions.begin(), status.regions.end(), Destroyer::HasCopy);
+  }
+  bool Happened(const std::string& event) const { return events_.find(event) != std::string::npos; }
+
   void ExpectExact(const RunOptions& options) const { aureole::ExpectExact(result_, options); }
 
   fs::path directory_;
@@ -88,24 +105,22 @@ TEST_F(Recovery, ServersKilledAtRandomMomentsChangeNoBit) {
   ExpectExact(options);
 }
 
-TEST_F(Recovery, PushesOfAClientActOnceEachWhileServersDie) {
-  constexpr int kBodies = 16, kPushes = 6000;
+void Recovery::ExpectPushesActOnce(int pushes, const RunObserver& trouble) {
+  constexpr int kBodies = 16;
   constexpr double kPush = 1.0 / 1024;  // m/s: sums are exact
   RunOptions options;
   options.world = Lanes(kBodies);
   options.regions = 3;
   options.checkpoint_every = 40;
-  Killer killer(3, 12, milliseconds(400));
   std::vector<double> expected(kBodies, 0);
   std::map<uint64_t, double> found;
   client::PushCounts counts;
   std::atomic<bool> pushed = false, seen = false;
-  bool together = false;
   std::atomic<int64_t> newest = 0;  // tick that was reported
   std::thread player;
   const auto play = [&](const std::vector<std::string>& endpoints) {
     client::PushSender sender(endpoints, 99);
-    for (int n = 0; n < kPushes; ++n) {
+    for (int n = 0; n < pushes; ++n) {
       client::Push push;
       push.body = static_cast<uint64_t>(1 + n * 7 % kBodies);
       push.kind = client::Push::Kind::kVelocityChange;
@@ -142,24 +157,98 @@ TEST_F(Recovery, PushesOfAClientActOnceEachWhileServersDie) {
       for (const RegionStatus& r : status.regions) endpoints.push_back(r.endpoint);
       player = std::thread([play, endpoints] { play(endpoints); });
     }
-    if (!pushed) killer.Look(status);
+    if (!pushed) trouble(status);
+    return !seen;
+  });
+  player.join();
+  EXPECT_EQ(s.code(), absl::StatusCode::kCancelled) << s;
+  EXPECT_EQ(counts.rejected, 0);
+  EXPECT_EQ(counts.applied, int64_t{pushes});
+  ASSERT_EQ(found.size(), size_t{kBodies});
+  for (const auto& [id, velocity] : found) EXPECT_EQ(velocity, expected[id - 1]) << "body " << id;
+}
+
+TEST_F(Recovery, PushesOfAClientActOnceEachWhileServersDie) {
+  Killer killer(3, 12, milliseconds(400));
+  bool together = false;
+  ExpectPushesActOnce(6000, [&](const RunStatus& status) {
+    killer.Look(status);
     // Once, all at the same time: nobody knows then how far the world had come.
-    if (!pushed && !together && killer.killed() >= 4 && status.MinTick() > 100) {
+    if (!together && killer.killed() >= 4 && status.MinTick() > 100) {
       together = true;
       for (const RegionStatus& r : status.regions) {
         if (r.pid > 0 && r.joined && !r.left) kill(static_cast<pid_t>(r.pid), SIGKILL);
       }
     }
-    return !seen;
+    return true;
   });
-  player.join();
-  EXPECT_EQ(s.code(), absl::StatusCode::kCancelled) << s;
   EXPECT_GE(killer.killed(), 6);
   EXPECT_TRUE(together);
-  EXPECT_EQ(counts.rejected, 0);
-  EXPECT_EQ(counts.applied, int64_t{kPushes});
-  ASSERT_EQ(found.size(), size_t{kBodies});
-  for (const auto& [id, velocity] : found) EXPECT_EQ(velocity, expected[id - 1]) << "body " << id;
+}
+
+TEST_F(Recovery, PushesOfAClientActOnceEachWhileServersAndTheirVolumesDie) {
+  Destroyer destroyer(directory_ / "data", 4);
+  ExpectPushesActOnce(12000, [&](const RunStatus& status) {
+    destroyer.Look(status);
+    return true;
+  });
+  EXPECT_GE(destroyer.destroyed(), 3) << events_;
+}
+
+TEST_F(Recovery, LostVolumesChangeNoBit) {
+  const RunOptions options = OptionsFor("corner-storm.json", 900);
+  Destroyer destroyer(directory_ / "data", 4);
+  const absl::Status s = Run(options, [&](const RunStatus& status) {
+    destroyer.Look(status);
+    return true;
+  });
+  ASSERT_TRUE(s.ok()) << s;
+  EXPECT_GE(destroyer.destroyed(), 3) << events_;
+  EXPECT_TRUE(Happened("region 0: goes on from the copy at region 1, of tick ")) << events_;
+  ExpectExact(options);
+}
+
+// Its keeper is recovered first, from its own volume, which has the copy.
+TEST_F(Recovery, LostVolumeIsRecoveredThoughItsKeeperDiesToo) {
+  const RunOptions options = OptionsFor("demo.json", 300);
+  bool killed = false;
+  const absl::Status s = Run(options, [&](const RunStatus& status) {
+    if (killed || !AllHaveCopies(status)) return true;
+    killed = true;
+    const RegionStatus &lost = status.regions[3], &keeper = status.regions[0];
+    EXPECT_EQ(kill(static_cast<pid_t>(lost.pid), SIGKILL), 0);
+    EXPECT_EQ(kill(static_cast<pid_t>(keeper.pid), SIGKILL), 0);
+    fs::remove_all(directory_ / "data/region-3");
+    return true;
+  });
+  ASSERT_TRUE(s.ok()) << s;
+  EXPECT_TRUE(Happened("region 3: goes on from the copy at region 0")) << events_;
+  ExpectExact(options);
+}
+
+TEST_F(Recovery, StaleVolumeIsNotUsed) {
+  const RunOptions options = OptionsFor("demo.json", 600);
+  const fs::path data = directory_ / "data/region-1", stale = directory_ / "stale";
+  enum { kBegins, kLost, kStale } phase = kBegins;
+  const absl::Status s = Run(options, [&](const RunStatus& status) {
+    const auto pid = static_cast<pid_t>(status.regions[1].pid);
+    if (!AllHaveCopies(status)) return true;
+    if (phase == kBegins) {
+      phase = kLost;
+      EXPECT_EQ(kill(pid, SIGKILL), 0);
+      fs::rename(data, stale);
+    } else if (phase == kLost && status.regions[1].incarnation == 2) {
+      phase = kStale;  // another node, which ran the region once
+      EXPECT_EQ(kill(pid, SIGKILL), 0);
+      fs::remove_all(data);
+      fs::rename(stale, data);
+    }
+    return true;
+  });
+  ASSERT_TRUE(s.ok()) << s;
+  EXPECT_EQ(phase, kStale);
+  EXPECT_TRUE(Happened("/i1 is stale: incarnation 2 has gone on elsewhere")) << events_;
+  ExpectExact(options);
 }
 
 TEST_F(Recovery, AllServersKilledAtOnceGoOn) {
@@ -221,22 +310,68 @@ TEST_F(Recovery, ServerThatCannotBeEndedIsFenced) {
   ExpectExact(options);
 }
 
-TEST_F(Recovery, DamagedCheckpointEndsTheRunAndIsNamed) {
+TEST_F(Recovery, DamagedCheckpointIsReplacedByTheCopy) {
+  const RunOptions options = OptionsFor("demo.json", 300);
+  bool killed = false;
+  const absl::Status s = Run(options, [&](const RunStatus& status) {
+    if (killed || !AllHaveCopies(status)) return true;
+    killed = true;
+    const auto pid = static_cast<pid_t>(status.regions[3].pid);
+    EXPECT_EQ(kill(pid, SIGSTOP), 0);
+    Damage(directory_ / "data/region-3/i1/checkpoint");
+    EXPECT_EQ(kill(pid, SIGKILL), 0);
+    return true;
+  });
+  ASSERT_TRUE(s.ok()) << s;
+  EXPECT_TRUE(Happened("region 3: goes on from the copy at region 0, of tick ")) << events_;
+  EXPECT_TRUE(Happened("/checkpoint: the checkpoint's check sum is wrong")) << events_;
+  ExpectExact(options);
+}
+
+TEST_F(Recovery, DamagedCheckpointAndCopyEndTheRunAndAreNamed) {
   const RunOptions options = OptionsFor("demo.json", 0);
   bool killed = false;
   const absl::Status s = Run(options, [&](const RunStatus& status) {
-    if (killed || status.stage != Stage::kRunning || status.MinTick() < 100) return true;
+    if (killed || !AllHaveCopies(status)) return true;
     killed = true;
-    EXPECT_EQ(kill(static_cast<pid_t>(status.regions[3].pid), SIGSTOP), 0);
-    std::fstream file(directory_ / "data/region-3/i1/checkpoint", std::ios::in | std::ios::out | std::ios::binary);
-    file.seekp(100);
-    file.put('\x55');
-    file.close();
-    EXPECT_EQ(kill(static_cast<pid_t>(status.regions[3].pid), SIGKILL), 0);
+    const auto pid = static_cast<pid_t>(status.regions[3].pid);
+    EXPECT_EQ(kill(pid, SIGSTOP), 0);
+    std::this_thread::sleep_for(milliseconds(100));  // what is under way to the copy is there
+    Damage(directory_ / "data/region-3/i1/checkpoint");
+    Damage(directory_ / "data/region-0/copies/region-3/i1/checkpoint");
+    EXPECT_EQ(kill(pid, SIGKILL), 0);
     return true;
   });
   EXPECT_EQ(s.code(), absl::StatusCode::kAborted) << s;
-  EXPECT_NE(s.message().find("/checkpoint: the checkpoint's check sum is wrong"), std::string::npos) << s;
+  EXPECT_NE(
+      s.message().find("data/region-3/i2/checkpoint: the checkpoint's check sum is wrong; and no copy at region 0: "),
+      std::string::npos)
+      << s;
+  EXPECT_NE(s.message().find("copies/region-3/"), std::string::npos) << s;
+}
+
+TEST_F(Recovery, RegionWithoutACopyGoesOnAndSaysSo) {
+  const RunOptions options = OptionsFor("demo.json", 500);
+  const fs::path copies = directory_ / "data/region-2/copies", away = directory_ / "away";
+  enum { kBegins, kAway, kBack } phase = kBegins;
+  const absl::Status s = Run(options, [&](const RunStatus& status) {
+    if (phase == kBegins && AllHaveCopies(status)) {
+      fs::rename(copies, away);
+      std::ofstream{copies} << "in the way";
+      phase = kAway;
+    } else if (phase == kAway && Happened("region 1: is not protected by a copy")) {
+      fs::remove(copies);
+      fs::rename(away, copies);
+      phase = kBack;
+    }
+    return true;
+  });
+  ASSERT_TRUE(s.ok()) << s;
+  EXPECT_TRUE(Happened("region 1: is not protected by a copy: its keeper, region 2: ")) << events_;
+  EXPECT_TRUE(Happened("region 1: is protected by a copy again")) << events_;
+  EXPECT_FALSE(Happened("is not protected by checkpoints")) << events_;
+  EXPECT_GT(result_.status.regions[1].report.copy_failures(), 0);
+  ExpectExact(options);
 }
 
 TEST_F(Recovery, RegionThatCannotWriteGoesOnAndSaysSo) {
@@ -247,7 +382,7 @@ TEST_F(Recovery, RegionThatCannotWriteGoesOnAndSaysSo) {
     if (phase == kBefore && status.MinTick() > 60) {
       fs::rename(data, away);
       phase = kAway;
-    } else if (phase == kAway && events_.find("region 1: is not protected") != std::string::npos) {
+    } else if (phase == kAway && Happened("region 1: is not protected by checkpoints")) {
       fs::rename(away, data);
       phase = kBack;
     }

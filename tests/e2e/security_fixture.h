@@ -23,6 +23,7 @@
 #include "server/control/control_service.h"
 #include "server/control/issue_token.h"
 #include "server/control/write_file.h"
+#include "server/region/copy_keeper.h"
 #include "server/transport/link_limits.h"
 #include "server/transport/peer_link.h"
 #include "server/transport/peer_service.h"
@@ -102,6 +103,7 @@ class GuardedServer {
     guard.Register(&builder, v1::Peer::service_full_name(), &peers_);
     guard.Register(&builder, v1::Simulation::service_full_name(), &simulation_);
     guard.Register(&builder, v1::Recording::service_full_name(), &recording_);
+    guard.Register(&builder, v1::Copies::service_full_name(), &copies_);
     guard.Register(&builder, v1::Control::service_full_name(), &control_);
     guard.Register(&builder, v1::ControlPlane::service_full_name(), &operators_);
     server_ = builder.BuildAndStart();
@@ -142,6 +144,7 @@ class GuardedServer {
   PeerService peers_;
   SimulationService simulation_;
   RecordingService recording_;
+  CopyKeeper copies_{""};
   ControlService control_;
   const World world_{*Layout::Columns({})};
   LayoutDesk desk_{world_};

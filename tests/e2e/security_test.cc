@@ -73,6 +73,7 @@ std::string PathOf(const std::string& full_name) {
 
 constexpr char kLink[] = "/aureole.v1.Peer/Link";
 constexpr char kJoin[] = "/aureole.v1.Control/Join";
+constexpr char kKeep[] = "/aureole.v1.Copies/Keep", kFetch[] = "/aureole.v1.Copies/Fetch";
 constexpr char kGetWorld[] = "/aureole.v1.Simulation/GetWorld";
 constexpr char kAdmitted[] = "the first message is no hello";  // Link's handler has been reached
 
@@ -142,7 +143,7 @@ TEST_F(MutualTls, ExpiredCertificateIsRefusedByBothSides) {
 TEST_F(MutualTls, CertificateOfAClientOpensNoServersMethod) {
   const GuardedServer server(Open(Certificates("server")));
   const auto client = Open(Certificates("client", authority_, authority_, Now(), {"player.aureole"}));
-  for (const char* method : {kLink, kJoin}) {
+  for (const char* method : {kLink, kKeep, kFetch, kJoin}) {
     EXPECT_EQ(CallAs(*client, server.endpoint(), method), "NOT_A_SERVER it does not have the DNS name server.aureole");
     EXPECT_EQ(Call(client::ChannelTo(server.endpoint(), Trusting(authority_), Fresh()), method),
               "NOT_A_SERVER there is no certificate");
@@ -196,8 +197,9 @@ TEST_F(GuardedCalls, TokenOpensNoServersMethodInPlainTextEither) {
   const GuardedServer server(Open("", TokenPath()));
   const auto channel = client::ChannelTo(server.endpoint(), {"", token}, Fresh());
   EXPECT_EQ(Call(channel, kGetWorld), "NO_REGION");
-  EXPECT_EQ(Call(channel, kLink), "NOT_A_SERVER no token opens it");
-  EXPECT_EQ(Call(channel, kJoin), "NOT_A_SERVER no token opens it");
+  for (const char* method : {kLink, kKeep, kFetch, kJoin}) {
+    EXPECT_EQ(Call(channel, method), "NOT_A_SERVER no token opens it") << method;
+  }
 }
 
 TEST_F(GuardedCalls, ServersAreOpenToClientsWithoutAFileOfTokens) {

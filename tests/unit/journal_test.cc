@@ -49,7 +49,7 @@ class JournalTest : public testing::Test {
   }
   // Of a new process.
   absl::StatusOr<Journal::Recovered> Recover(RegionId region = 2, uint64_t world = kWorld) {
-    return Open()->Recover(world, region);
+    return Open()->Recover(world, region, {});
   }
   static void WriteAndWait(Journal* j, Checkpoint c) {
     j->Write(std::move(c));
@@ -191,6 +191,87 @@ TEST_F(JournalTest, NewWorldForgetsWhatWasThere) {
   EXPECT_TRUE(Recover()->inputs.empty());
 }
 
+TEST_F(JournalTest, StaleVolumeIsRefusedAndLeftAlone) {
+  ASSERT_TRUE(Open()->Begin(CheckpointOf(40)).ok());
+  const fs::path checkpoint = Checkpoint();
+  incarnation_ = 3;
+  const absl::Status old = Open()->Recover(kWorld, 2, {2, 0}).status();
+  EXPECT_EQ(old.code(), absl::StatusCode::kFailedPrecondition) << old;
+  EXPECT_THAT(std::string(old.message()), HasSubstr("/i1 is stale: incarnation 2 has gone on elsewhere"));
+  EXPECT_TRUE(fs::exists(checkpoint));
+  const absl::Status lacking = Open()->Recover(kWorld, 2, {1, 41}).status();
+  EXPECT_EQ(lacking.code(), absl::StatusCode::kFailedPrecondition) << lacking;
+  EXPECT_THAT(std::string(lacking.message()),
+              HasSubstr("is of tick 40, and what was not logged here is as late as 41"));
+  EXPECT_TRUE(Open()->Recover(kWorld, 2, {1, 40}).ok());
+}
+
+TEST_F(JournalTest, WhatWasRecoveredElsewhereReplacesWhatIsHere) {
+  {
+    const auto j = Open();
+    ASSERT_TRUE(j->Begin(CheckpointOf(40)).ok());
+    j->Log(41, {Push(1)});
+    ASSERT_TRUE(j->AwaitLogged().ok());
+  }
+  {
+    const auto j = Open();
+    ASSERT_TRUE(j->Adopt({CheckpointOf(80), {{81, Push(2)}, {83, Push(3)}}}).ok());
+    j->Log(84, {Push(4)});
+    ASSERT_TRUE(j->AwaitLogged().ok());
+  }
+  const absl::StatusOr<Journal::Recovered> found = Recover();
+  ASSERT_TRUE(found.ok()) << found.status();
+  EXPECT_EQ(found->checkpoint.tick, 80);
+  EXPECT_EQ(SequencesOf(*found), (std::vector<uint64_t>{2, 3, 4}));
+}
+
+// A keeper goes on with what it has, again and again, also as the same incarnation.
+TEST_F(JournalTest, JournalThatContinuesKeepsAllUntilTheNextCheckpoint) {
+  {
+    const auto j = Open();
+    EXPECT_TRUE(j->Continue().ok()) << "nothing is there";
+    j->WriteEncoded(5, EncodeCheckpoint(CheckpointOf(5)));
+    while (j->writing()) std::this_thread::yield();
+  }
+  for (Tick n = 6; n < 12; ++n) {
+    if (n % 2 == 0) --incarnation_;
+    const auto j = Open();
+    ASSERT_TRUE(j->Continue().ok());
+    // The last that was there is said again, after the connection was lost.
+    for (Tick again = n - (n > 6 ? 1 : 0); again <= n; ++again) {
+      j->LogRecords(again, EncodeInputs({{again, Push(static_cast<uint64_t>(again))}}));
+      ASSERT_TRUE(j->AwaitLogged().ok());
+    }
+    EXPECT_LE(Logs().size(), 2);
+  }
+  Keep();
+  EXPECT_EQ(SequencesOf(*Recover()), (std::vector<uint64_t>{6, 7, 8, 9, 10, 11}));
+  const auto j = Open();
+  ASSERT_TRUE(j->Continue().ok());
+  j->WriteEncoded(12, EncodeCheckpoint(CheckpointOf(12)));
+  while (j->writing()) std::this_thread::yield();
+  EXPECT_TRUE(Recover()->inputs.empty());
+}
+
+TEST_F(JournalTest, DamagedCopyIsNoReasonNotToBeginAnother) {
+  {
+    const auto j = Open();
+    ASSERT_TRUE(j->Begin(CheckpointOf(0)).ok());
+    j->Log(1, {Push(1)});
+    ASSERT_TRUE(j->AwaitLogged().ok());
+    WriteAndWait(j.get(), CheckpointOf(0));
+    j->Log(2, {Push(2)});
+    ASSERT_TRUE(j->AwaitLogged().ok());
+  }
+  std::fstream(Logs().at(0), std::ios::in | std::ios::out | std::ios::binary).seekp(20).put('\x55');
+  ASSERT_EQ(Open()->Recover(kWorld, 2, {}).status().code(), absl::StatusCode::kDataLoss);
+  const auto j = Open();
+  ASSERT_TRUE(j->Continue().ok());
+  j->WriteEncoded(7, EncodeCheckpoint(CheckpointOf(7)));
+  while (j->writing()) std::this_thread::yield();
+  EXPECT_EQ(Recover()->checkpoint.tick, 7);
+}
+
 // It may still run where nobody can end it, on a machine that is cut off.
 TEST_F(JournalTest, IncarnationThatWasTakenOverMakesNothingDurable) {
   const auto old = Open();
@@ -199,7 +280,7 @@ TEST_F(JournalTest, IncarnationThatWasTakenOverMakesNothingDurable) {
   ASSERT_TRUE(old->AwaitLogged().ok());
   EXPECT_FALSE(old->fenced());
   const auto next = Open();
-  EXPECT_EQ(SequencesOf(*next->Recover(kWorld, 2)), (std::vector<uint64_t>{1}));
+  EXPECT_EQ(SequencesOf(*next->Recover(kWorld, 2, {})), (std::vector<uint64_t>{1}));
   old->Log(2, {Push(2)});
   const absl::Status s = old->AwaitLogged();
   EXPECT_EQ(s.code(), absl::StatusCode::kAborted) << s;
@@ -209,7 +290,7 @@ TEST_F(JournalTest, IncarnationThatWasTakenOverMakesNothingDurable) {
   next->Log(2, {Push(3)});
   ASSERT_TRUE(next->AwaitLogged().ok());
   const auto third = Open();
-  const absl::StatusOr<Journal::Recovered> found = third->Recover(kWorld, 2);
+  const absl::StatusOr<Journal::Recovered> found = third->Recover(kWorld, 2, {});
   EXPECT_EQ(found->checkpoint.tick, 0);
   EXPECT_EQ(SequencesOf(*found), (std::vector<uint64_t>{1, 3})) << "nothing of what the first wrote too late";
 }
@@ -226,7 +307,7 @@ TEST_F(JournalTest, IncarnationThatWasTakenOverSeesItAtACheckpoint) {
 TEST_F(JournalTest, EarlierIncarnationThatComesLateIsRefused) {
   const auto late = Open();
   ASSERT_TRUE(Open()->Begin(CheckpointOf(0)).ok());
-  EXPECT_EQ(late->Recover(kWorld, 2).status().code(), absl::StatusCode::kAborted);
+  EXPECT_EQ(late->Recover(kWorld, 2, {}).status().code(), absl::StatusCode::kAborted);
   EXPECT_EQ(late->Begin(CheckpointOf(0)).code(), absl::StatusCode::kAborted);
 }
 
@@ -257,7 +338,7 @@ TEST_F(JournalTest, FullDiskIsCountedAndTheLastCheckpointStays) {
   EXPECT_EQ(j->stats().durable_tick, 7);
   Keep();
   const auto copy = Journal::Open(directory_ / "kept", 2);
-  EXPECT_EQ((*copy)->Recover(kWorld, 2)->checkpoint.tick, 7);
+  EXPECT_EQ((*copy)->Recover(kWorld, 2, {})->checkpoint.tick, 7);
 
   j->Log(9, {Push(2)});
   EXPECT_TRUE(j->AwaitLogged().ok());
