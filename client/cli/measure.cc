@@ -169,7 +169,7 @@ Comparison Compare(const RunMeasure& split, const RunMeasure& undivided, Tick la
   Comparison out;
   std::map<Tick, TickSum> have;
   for (const TickSum& sum : split.hashes) {
-    if (sum.regions == static_cast<int>(split.regions.size())) have[sum.tick] = sum;
+    if (sum.complete()) have[sum.tick] = sum;
   }
   bool at_end = false;
   out.hash_equal = true;

@@ -123,7 +123,7 @@ Json ResultJson(const Heading& heading, const UpOptions& options, const absl::St
     regions.push_back(RegionJson(result.status.regions[i], i));
   }
   for (const TickSum& sum : result.hashes) {
-    if (sum.regions != static_cast<int>(result.status.regions.size())) continue;
+    if (!sum.complete()) continue;
     hashes.push_back({{"tick", sum.tick}, {"hash", absl::StrFormat("%016x", sum.hash)}, {"bodies", sum.bodies}});
   }
   for (const v1::Violation& v : result.violations) {
@@ -154,7 +154,7 @@ std::string Summary(const Heading& heading, const RunResult& result) {
   std::string out = absl::StrFormat("%d ticks, %.1f s simulated in %.1f s; %d bodies", tick,
                                     static_cast<double>(tick) * static_cast<double>(heading.tick_us) * 1e-6,
                                     result.wall_seconds, result.status.Bodies());
-  if (!result.hashes.empty() && result.hashes.back().regions == static_cast<int>(result.status.regions.size())) {
+  if (!result.hashes.empty() && result.hashes.back().complete()) {
     const TickSum& sum = result.hashes.back();
     absl::StrAppendFormat(&out, "; state hash %016x at tick %d", sum.hash, sum.tick);
   }

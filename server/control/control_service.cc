@@ -130,9 +130,8 @@ RunStatus ControlService::Status() const {
   out.stage = stage_;
   out.start_unix_us = start_unix_us_;
   for (const RegionRecord& record : regions_) out.regions.push_back(record.status);
-  const auto whole = std::find_if(hashes_.rbegin(), hashes_.rend(), [this](const auto& entry) {
-    return entry.second.regions == static_cast<int>(regions_.size());
-  });
+  const auto whole =
+      std::find_if(hashes_.rbegin(), hashes_.rend(), [](const auto& entry) { return entry.second.complete(); });
   if (whole != hashes_.rend()) out.hash = whole->second;
   return out;
 }
@@ -443,6 +442,7 @@ absl::Status ControlService::HandleReport(RegionRecord* record, const v1::Report
     TickSum& sum = hashes_[h.tick()];
     sum.tick = h.tick();
     sum.hash += h.hash();
+    sum.members = h.members();
     sum.bodies += h.bodies();
     ++sum.regions;
   }

@@ -44,7 +44,10 @@ struct TickSum {
   Tick tick = 0;
   uint64_t hash = 0;
   int64_t bodies = 0;
-  int regions = 0;  // that have reported this tick; complete when all have
+  int regions = 0;  // that have reported this tick
+  int members = 0;  // that will
+
+  bool complete() const { return regions > 0 && regions == members; }
 };
 
 // Something that the control plane has decided, or has seen happen.

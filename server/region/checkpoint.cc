@@ -14,7 +14,7 @@ void Visit(Archive& a, LinkState& v) {
 
 namespace {
 
-constexpr uint64_t kMagic = 0x3254504b43524100;  // of this layout of the bytes
+constexpr uint64_t kMagic = 0x3354504b43524100;  // of this layout of the bytes
 
 template <class Archive>
 void VisitCheckpoint(Archive& a, Checkpoint& c) {

@@ -22,10 +22,11 @@ struct Checkpoint {
     Tick tick = 0;
     uint64_t hash = 0;
     int64_t bodies = 0;
+    int32_t members = 1;  // regions that have a part of this tick
 
     template <class Archive>
     void Visit(Archive& a) {
-      a(tick, hash, bodies);
+      a(tick, hash, bodies, members);
     }
   };
 

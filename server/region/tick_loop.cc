@@ -243,6 +243,7 @@ void TickLoop::AppendHash(const aureole::Checkpoint::Hash& h) {
   hash->set_tick(h.tick);
   hash->set_hash(h.hash);
   hash->set_bodies(h.bodies);
+  hash->set_members(h.members);
 }
 
 void TickLoop::AppendRecentHashes() {
@@ -342,7 +343,8 @@ void TickLoop::AfterTick() {
   if ((options_.hash_every > 0 && n % options_.hash_every == 0) || n == options_.last_tick) {
     std::vector<BodyRecord> records;  // those in flight included
     region_->Observe(&records);
-    AddHash({n, region_->StateHash(), static_cast<int64_t>(records.size())});
+    AddHash({n, region_->StateHash(), static_cast<int64_t>(records.size()),
+             static_cast<int32_t>(region_->members().size())});
   }
   if (const std::vector<InputOutcome> outcomes = region_->TakeOutcomes(); !outcomes.empty()) {
     hooks_.outcomes(outcomes);

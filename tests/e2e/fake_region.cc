@@ -125,6 +125,7 @@ v1::Report FakeRegion::MakeReport(const v1::Assignment& assignment, int64_t from
       const uint64_t others = static_cast<uint64_t>(n - 1) * other;
       hash->set_hash(assignment.region() == 0 ? FakeHash(tick) - others : other);
       hash->set_bodies(kFakeBodies / n);
+      hash->set_members(n);
       if (misbehaves && behaviour_.wrong_hash && tick >= 200) hash->set_hash(hash->hash() + 1);
       if (misbehaves && behaviour_.lose_at >= 0 && tick >= behaviour_.lose_at) hash->set_bodies(hash->bodies() - 1);
     }

@@ -320,6 +320,24 @@ TEST_F(WorldLife, ChangeThatCannotBeIsSaidAndTheRunGoesOn) {
   ExpectEndAsUndisturbed();
 }
 
+TEST_F(WorldLife, ScaledWorldGetsAndLosesServersAndNoBitChanges) {
+  cluster_.StartControl(0);
+  Create(Spec());
+  ASSERT_TRUE(AwaitTick(20));
+  for (const int replicas : {4, 3}) {
+    cluster_.api().Merge(absl::StrCat(kWorlds, "w"), {{"spec", {{"replicas", replicas}}}});
+    const std::string all = absl::StrCat(replicas, "/", replicas);
+    ASSERT_TRUE(Await([&] { return TextAt(Status(), {"regionsReady"}) == all && cluster_.processes() == static_cast<size_t>(replicas); }))
+        << Status().dump(1);
+    EXPECT_EQ(IntegerAt(Status(), {"replicas"}), replicas);
+  }
+  EXPECT_EQ(Condition("Applied", "status"), "True");
+  cluster_.api().Merge(absl::StrCat(kWorlds, "w"), {{"spec", {{"replicas", 65}}}});
+  ASSERT_TRUE(Await([&] { return Condition("Applied", "status") == "False"; }));
+  EXPECT_TRUE(absl::StartsWith(Condition("Applied", "message"), "spec.replicas: is 65"));
+  ExpectEndAsUndisturbed();
+}
+
 TEST_F(WorldLife, WorldsOfOneControlPlaneDoNotMix) {
   cluster_.StartControl(0);
   Json spec = Spec();

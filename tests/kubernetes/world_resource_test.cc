@@ -133,7 +133,7 @@ TEST(WorldResource, RefusalsNameTheFieldAndChangeNothing) {
       {"/checkpointSeconds", 0, "spec.checkpointSeconds: must be above 0"},
       {"/checkpointSeconds", "1s", "spec.checkpointSeconds: must be above 0"},
       {"/policy", "GoOn", "spec.policy: is GoOn; only Wait is possible"},
-      {"/replicas", 5, "spec.replicas: is 5, but the world's layout has 4 regions"},
+      {"/replicas", 65, "spec.replicas: is 65; regions allows 1 to 64"},
       {"/regions", {{"min", 5}, {"max", 4}}, "spec.regions: min 5 is above max 4"},
   };
   for (const auto& tested : cases) {

@@ -56,7 +56,7 @@ const Condition& Of(const WorldStatus& status, const std::string& type) {
 TEST(WorldStatus, SaysWhatRuns) {
   RunStatus run = Running();
   EXPECT_FALSE(StatusOf(World(), run, {}).fields.contains("hash"));
-  run.hash = {50, 0x1234, 21, 2};
+  run.hash = {50, 0x1234, 21, 2, 2};
   const WorldStatus status = StatusOf(World(), run, {{0, Pod(0)}, {1, Pod(1)}});
   EXPECT_EQ(status.generation, 4);
   EXPECT_EQ(status.fields["hash"], (Json{{"tick", 50}, {"hash", "0000000000001234"}, {"bodies", 21}}));

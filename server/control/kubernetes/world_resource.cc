@@ -9,6 +9,7 @@
 #include <absl/time/time.h>
 
 #include "server/control/world_file.h"
+#include "server/core/limits.h"
 #include "server/transport/world_json.h"
 #include "server/transport/world_spec.h"
 
@@ -105,18 +106,18 @@ absl::Status ReadPods(const Json& spec, const PodDefaults& defaults, PodTemplate
   return absl::OkStatus();
 }
 
-absl::Status CheckRegions(const Json& spec, int regions) {
+absl::StatusOr<int> ReadReplicas(const Json& spec, int regions) {
   const int64_t least = IntegerAt(spec, {"regions", "min"}).value_or(1),
-                most = IntegerAt(spec, {"regions", "max"}).value_or(std::max<int64_t>(least, regions));
+                most = IntegerAt(spec, {"regions", "max"}).value_or(limits::kMaxRegions);
   if (least > most) return Refuse("regions", absl::StrFormat("min %d is above max %d", least, most));
   const int64_t wanted = IntegerAt(spec, {"replicas"}).value_or(regions);
-  if (wanted == regions) return absl::OkStatus();
-  return Refuse("replicas", absl::StrFormat("is %d, but the world's layout has %d regions; change the layout of a new "
-                                            "world, or leave replicas out",
-                                            wanted, regions));
+  if (wanted >= least && wanted <= most && wanted <= limits::kMaxRegions) return static_cast<int>(wanted);
+  return Refuse("replicas", absl::StrFormat("is %d; regions allows %d to %d", wanted, least,
+                                            std::min<int64_t>(most, limits::kMaxRegions)));
 }
 
-// Regions whose rectangles touch, if only in a point.
+}  // namespace
+
 std::vector<std::vector<RegionId>> Neighbours(const std::vector<Rect>& homes) {
   std::vector<std::vector<RegionId>> out(homes.size());
   for (size_t a = 0; a < homes.size(); ++a) {
@@ -130,8 +131,6 @@ std::vector<std::vector<RegionId>> Neighbours(const std::vector<Rect>& homes) {
   }
   return out;
 }
-
-}  // namespace
 
 Resource WorldsOf(const std::string& space) { return {kWorldGroup, kWorldVersion, "worlds", space}; }
 
@@ -181,7 +180,9 @@ absl::StatusOr<WorldResource> ReadWorld(const Json& object, const std::optional<
   if (absl::Status s = ReadRun(*spec, checked->environment.tick_us, &out.run); !s.ok()) return s;
   if (absl::Status s = ReadStorage(*spec, &out.pods.storage); !s.ok()) return s;
   if (absl::Status s = ReadPods(*spec, defaults, &out.pods); !s.ok()) return s;
-  if (absl::Status s = CheckRegions(*spec, out.run.regions); !s.ok()) return s;
+  const absl::StatusOr<int> replicas = ReadReplicas(*spec, out.run.regions);
+  if (!replicas.ok()) return replicas.status();
+  out.replicas = *replicas;
   out.fixed = Json::object();
   for (const char* field : kFixed) {
     if (const Json* const value = Find(*spec, {field}); value != nullptr) out.fixed[field] = *value;

@@ -38,7 +38,8 @@ struct WorldResource {
   int64_t generation = 0;
   RunOptions run;           // without what joins it to this process: hub, store, epoch
   PodTemplate pods;         // may change while the world runs, for the Pods to come; not its storage
-  std::vector<Rect> homes;  // by region
+  std::vector<Rect> homes;  // by region, in the layout with which the world begins
+  int replicas = 0;         // wanted number of regions
   Json fixed;               // what cannot change while the world runs, but for the world itself
   std::string world_hash;   // of the world itself, in hex
 };
@@ -47,6 +48,9 @@ struct WorldResource {
 // that is not sane; nothing is said of values that the API server refuses by itself (k8s/base/worlds.yaml).
 absl::StatusOr<WorldResource> ReadWorld(const Json& object, const std::optional<std::string>& file,
                                         const PodDefaults& defaults);
+
+// By region: those whose rectangles touch its own, if only in a point.
+std::vector<std::vector<RegionId>> Neighbours(const std::vector<Rect>& homes);
 
 // The object, but with `fixed` of another one.
 Json WithFixed(Json object, const Json& fixed);

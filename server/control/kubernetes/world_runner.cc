@@ -1,5 +1,7 @@
 #include "server/control/kubernetes/world_runner.h"
 
+#include <algorithm>
+#include <cmath>
 #include <utility>
 
 #include <absl/strings/match.h>
@@ -8,6 +10,8 @@
 #include <absl/strings/str_join.h>
 
 #include "server/control/kubernetes/backoff.h"
+#include "server/control/layout_desk.h"
+#include "server/transport/world_spec.h"
 
 namespace aureole::kubernetes {
 namespace {
@@ -43,6 +47,22 @@ std::string Differences(const WorldResource& runs, const WorldResource& wanted) 
   return absl::StrCat(absl::StrJoin(fields, ", "),
                       ": cannot change while the world runs; it goes on as it began. Change it back, or delete the "
                       "World and make it anew");
+}
+
+// As many regions as are wanted: columns where the world is in columns, else cells that are as square as their number
+// allows.
+absl::Status Scale(int replicas, LayoutDesk* desk) {
+  const LayoutDesk::State state = desk->state();
+  const std::vector<Rect>& homes = state.wanted.empty() ? state.now.regions : state.wanted;
+  if (std::count_if(homes.begin(), homes.end(), [](const Rect& r) { return r.HasArea(); }) == replicas) {
+    return absl::OkStatus();
+  }
+  const Layout& begins = desk->world().layout;
+  bool columns = true;
+  for (RegionId r = 0; r < begins.size(); ++r) columns &= std::isinf(begins.rect(r).min_z) && std::isinf(begins.rect(r).max_z);
+  int rows = 1;
+  for (int n = 2; !columns && n * n <= replicas; ++n) rows = replicas % n == 0 ? n : rows;
+  return desk->Resize(replicas / rows, rows);
 }
 
 // A reason for an event of the run, and whether it is a warning.
@@ -181,7 +201,14 @@ PodAllocator::Options WorldRunner::PodOptions(const PodTemplate& pods) const {
 WorldRunner::Next WorldRunner::RunOnce(WorldResource world) {
   PodAllocator allocator(context_->client, PodOptions(world.pods));
 
+  const absl::StatusOr<World> begins = WorldFromSpec(world.run.world);
+  if (!begins.ok()) {
+    return Refuse(world.generation, "Failed", "Refused", absl::StrCat("spec.world: ", begins.status().message()));
+  }
+  LayoutDesk desk(*begins);
+
   RunOptions run = world.run;
+  run.layouts = &desk;
   run.hub = context_->hub;
   run.advertise = context_->advertise;
   run.store = &store_;
@@ -199,6 +226,9 @@ WorldRunner::Next WorldRunner::RunOnce(WorldResource world) {
   Clock::time_point next_publish;
   Stage stage = Stage::kJoining;
   const auto publish = [&](const RunStatus& now) {
+    world.homes = desk.state().now.regions;
+    world.pods.neighbours = Neighbours(world.homes);
+    allocator.Use(world.pods);
     WorldStatus status = StatusOf(world, now, allocator.Newest());
     status.conditions.push_back(Applied(not_applied));
     const std::string phase = TextAt(status.fields, {"phase"});
@@ -210,6 +240,9 @@ WorldRunner::Next WorldRunner::RunOnce(WorldResource world) {
     if (const Object latest = Latest(); GenerationOf(*latest) != looked_at) {
       looked_at = GenerationOf(*latest);
       not_applied = Change(*latest, &world);
+      if (absl::Status s = Scale(world.replicas, &desk); !s.ok() && not_applied.empty()) {
+        not_applied = absl::StrCat("spec.replicas: ", s.message());
+      }
       allocator.Use(world.pods);
       if (!not_applied.empty()) Tell(true, "CannotChange", not_applied);
     }
@@ -251,6 +284,7 @@ std::string WorldRunner::Change(const Json& object, WorldResource* world) {
   const Storage storage = world->pods.storage;
   world->pods = wanted->pods;
   world->pods.storage = storage;
+  world->replicas = wanted->replicas;
   return Differences(*world, *wanted);
 }
 

@@ -20,6 +20,7 @@ bool Here(const RegionStatus& r) { return r.finished || (r.joined && r.ready && 
 
 std::string PhaseOf(const RegionStatus& r, const PodView* pod, bool running) {
   if (r.finished) return "Finished";
+  if (!r.member) return r.ready && r.report.tick() > 0 ? "Leaving" : "Joining";
   if (!r.joined || r.left) {
     if (pod != nullptr && !pod->started) return "Pending";
     return r.was_ready ? "Recovering" : "Starting";
@@ -76,7 +77,7 @@ Condition Degraded(const RunStatus& run) {
   std::vector<std::string> missing, unprotected;
   for (size_t i = 0; i < run.regions.size(); ++i) {
     const RegionStatus& r = run.regions[i];
-    if (run.start_unix_us != 0 && !Here(r)) missing.push_back(absl::StrCat("region ", i, " has no server"));
+    if (run.start_unix_us != 0 && r.member && !Here(r)) missing.push_back(absl::StrCat("region ", i, " has no server"));
     if (!r.report.storage_failure().empty()) {
       unprotected.push_back(
           absl::StrCat("region ", i, " is not protected by checkpoints: ", r.report.storage_failure()));
@@ -95,14 +96,18 @@ WorldStatus StatusOf(const WorldResource& world, const RunStatus& run, const std
   const bool running = run.stage >= Stage::kRunning;
   Json regions = Json::array();
   std::vector<std::string> waits = run.Waiting();
-  int here = 0;
+  int here = 0, members = 0;
   bool replaying = false;
   double slowest = std::numeric_limits<double>::infinity();
   for (size_t i = 0; i < run.regions.size(); ++i) {
     const RegionStatus& r = run.regions[i];
     const auto pod = pods.find(static_cast<RegionId>(i));
     const PodView* const view = pod == pods.end() ? nullptr : &pod->second;
-    regions.push_back(RegionOf(static_cast<RegionId>(i), world.homes[i], r, view, running));
+    if (!r.member && !Here(r) && view == nullptr) continue;  // it has left
+    const Rect home = i < world.homes.size() ? world.homes[i] : Rect{};
+    regions.push_back(RegionOf(static_cast<RegionId>(i), home, r, view, running));
+    if (!r.member) continue;  // it comes, or goes
+    ++members;
     here += Here(r) ? 1 : 0;
     replaying |= r.report.replaying();
     slowest = std::min(slowest, r.report.real_time_factor());
@@ -110,21 +115,21 @@ WorldStatus StatusOf(const WorldResource& world, const RunStatus& run, const std
       waits.push_back(absl::StrCat("region ", i, ": ", view->waits));
     }
   }
-  const bool all = here == static_cast<int>(run.regions.size());
+  const bool all = here == members;
   const std::string phase = run.stage == Stage::kFinished  ? "Finished"
                             : run.start_unix_us == 0       ? "Starting"
                             : all && running && !replaying ? "Running"
                                                            : "Recovering";
   out.fields = {{"phase", phase},
                 {"tick", run.MinTick()},
-                {"regionsReady", absl::StrCat(here, "/", run.regions.size())},
-                {"replicas", run.regions.size()},
+                {"regionsReady", absl::StrCat(here, "/", members)},
+                {"replicas", members},
                 {"selector", absl::StrCat(kWorldLabel, "=", world.name)},
                 {"bodies", run.Bodies()},
                 {"awake", run.Awake()},
                 {"realTimeFactor", std::isfinite(slowest) ? Rounded(slowest) : 0},
                 {"regions", regions}};
-  if (run.hash.regions > 0) {
+  if (run.hash.complete()) {
     out.fields["hash"] = {
         {"tick", run.hash.tick}, {"hash", absl::StrFormat("%016x", run.hash.hash)}, {"bodies", run.hash.bodies}};
   }
