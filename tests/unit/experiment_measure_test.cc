@@ -22,6 +22,7 @@ RunMeasure WithSums(int regions, std::vector<TickSum> sums) {
   RunMeasure m;
   m.regions.resize(static_cast<size_t>(regions));
   m.hashes = std::move(sums);
+  for (TickSum& sum : m.hashes) sum.members = regions;
   return m;
 }
 

@@ -59,7 +59,8 @@ absl::Status Scale(int replicas, LayoutDesk* desk) {
   }
   const Layout& begins = desk->world().layout;
   bool columns = true;
-  for (RegionId r = 0; r < begins.size(); ++r) columns &= std::isinf(begins.rect(r).min_z) && std::isinf(begins.rect(r).max_z);
+  for (RegionId r = 0; r < begins.size(); ++r)
+    columns &= std::isinf(begins.rect(r).min_z) && std::isinf(begins.rect(r).max_z);
   int rows = 1;
   for (int n = 2; !columns && n * n <= replicas; ++n) rows = replicas % n == 0 ? n : rows;
   return desk->Resize(replicas / rows, rows);
