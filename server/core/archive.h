@@ -92,6 +92,15 @@ class Writer {
   void operator()(const T&... v) {
     (Put(v), ...);
   }
+  // As the std::string to which `append` appends what it has; without making one.
+  template <class Append>
+  void Bytes(const Append& append) {
+    const size_t at = out_->size();
+    Put(size_t{0});
+    append(out_);
+    const size_t size = out_->size() - at - sizeof(size_t);
+    std::memcpy(out_->data() + at, &size, sizeof size);
+  }
 
  private:
   template <archive_internal::Plain T>

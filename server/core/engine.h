@@ -119,8 +119,13 @@ class Engine {
 
   // The whole state of these bodies (ascending ids): description, pose, velocities, sleep timer, forces, cached contact
   // points among them, joints among them. A set must be closed under joints and overlapping boxes. Extract also removes
-  // them, without waking anybody (P59).
-  virtual std::string Save(std::span<const BodyId> ids) const = 0;
+  // them, without waking anybody (P59). SaveTo appends.
+  virtual void SaveTo(std::span<const BodyId> ids, std::string* out) const = 0;
+  std::string Save(std::span<const BodyId> ids) const {
+    std::string out;
+    SaveTo(ids, &out);
+    return out;
+  }
   virtual std::string Extract(std::span<const BodyId> ids) = 0;
   // Adds what Save or Extract wrote. InvalidArgument when the bytes are not such a state, or a body is already here;
   // then nothing has changed.

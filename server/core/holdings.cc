@@ -297,7 +297,9 @@ void Holdings::CountHomes(std::span<const BodyId> near) {
 }
 
 void Holdings::Save(Writer& a) const {
-  a(tick, division, engine->Save(engine->Ids()), held, inboxes, stats, pending, live, newcomers_, homes_);
+  a(tick, division);
+  a.Bytes([this](std::string* out) { engine->SaveTo(engine->Ids(), out); });
+  a(held, inboxes, stats, pending, live, newcomers_, homes_);
 }
 
 bool Holdings::Load(Reader& a) {

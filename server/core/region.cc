@@ -218,14 +218,18 @@ RegionSnapshot Region::Snapshot() const {
 }
 
 std::string Region::Save() const {
+  std::string out;
+  SaveTo(&out);
+  return out;
+}
+
+void Region::SaveTo(std::string* out) const {
   AUREOLE_CHECK(phase() == Phase::kBegin || phase() == Phase::kLeft, "checkpoint of region %d within tick %lld", self(),
                 static_cast<long long>(tick()));
-  std::string out;
-  Writer writer(&out);
+  Writer writer(out);
   writer(self(), impl_->holdings.world.layout.size());
   impl_->holdings.Save(writer);
   impl_->protocol->Save(writer);
-  return out;
 }
 
 uint64_t Region::FramesTaken(RegionId peer) const {

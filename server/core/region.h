@@ -176,7 +176,8 @@ class Region {
 
   // All that decides this region's future, after a tick: given the frames of its peers that it has not taken yet, and
   // the inputs that are offered to it from here on, a region that is loaded from this does bit for bit what this one
-  // does. Precondition: the phase is kBegin or kLeft. Linear in the bodies.
+  // does. Precondition: the phase is kBegin or kLeft. Linear in the bodies. Appends.
+  void SaveTo(std::string* out) const;
   std::string Save() const;
   // Frames of this peer that were taken by phases since the beginning of the world, by this region and those that it
   // was loaded from. Those that only wait are not in Save, and must come again after Load. Counted anew when a peer

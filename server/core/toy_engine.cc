@@ -246,9 +246,10 @@ class ToyEngine final : public Engine {
 
   double MaxRadius() const override { return max_radius_; }
 
-  std::string Save(std::span<const BodyId> ids) const override {
-    std::string bytes(sizeof(Header), '\0');
-    auto append = [&bytes](const auto& v) { bytes.append(reinterpret_cast<const char*>(&v), sizeof v); };
+  void SaveTo(std::span<const BodyId> ids, std::string* bytes) const override {
+    const size_t begin = bytes->size();
+    bytes->resize(begin + sizeof(Header));
+    auto append = [bytes](const auto& v) { bytes->append(reinterpret_cast<const char*>(&v), sizeof v); };
     auto in = [ids](BodyId id) { return std::binary_search(ids.begin(), ids.end(), id); };
     Header h{kMagic, ids.size(), 0, 0};
     for (BodyId id : ids) append(At(id));
@@ -264,8 +265,7 @@ class ToyEngine final : public Engine {
       append(j);
       ++h.joints;
     }
-    std::memcpy(bytes.data(), &h, sizeof h);
-    return bytes;
+    std::memcpy(bytes->data() + begin, &h, sizeof h);
   }
 
   std::string Extract(std::span<const BodyId> ids) override {

@@ -28,6 +28,7 @@ struct Pair {
   Body* b = nullptr;
   size_t index_a = 0, index_b = 0;    // in a->pairs and b->pairs
   std::vector<PartContact> contacts;  // ascending parts
+  bool touches = false;               // one of them has points
 
   Body* Other(const Body* self) const { return self == a ? b : a; }
 };

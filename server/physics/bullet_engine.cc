@@ -78,7 +78,7 @@ class BulletEngine : public Engine {
   void TakeSleep(std::vector<BodyId>* slept, std::vector<BodyId>* woke) override { world_.TakeSleep(slept, woke); }
   double MaxRadius() const override { return world_.max_radius(); }
 
-  std::string Save(std::span<const BodyId> ids) const override;
+  void SaveTo(std::span<const BodyId> ids, std::string* out) const override;
   std::string Extract(std::span<const BodyId> ids) override;
   absl::Status Restore(std::string_view state) override { return RestoreState(state, &world_); }
   std::unique_ptr<Engine> Scratch() const override {
@@ -248,9 +248,9 @@ void BulletEngine::Query(const Box& box, std::vector<BodyId>* out) const {
   std::sort(out->begin() + first, out->end());
 }
 
-std::string BulletEngine::Save(std::span<const BodyId> ids) const {
+void BulletEngine::SaveTo(std::span<const BodyId> ids, std::string* out) const {
   for (BodyId id : ids) Get(id);
-  return SaveState(world_, ids);
+  SaveState(world_, ids, out);
 }
 
 std::string BulletEngine::Extract(std::span<const BodyId> ids) {

@@ -168,9 +168,12 @@ Vec3 GetVec3(double bound, ByteReader* in) {
 }
 
 std::string EncodeShape(const Shape& shape) {
-  ByteWriter out;
-  PutShape(shape, &out);
-  return out.Take();
+  std::string bytes;
+  {
+    ByteWriter out(&bytes);
+    PutShape(shape, &out);
+  }
+  return bytes;
 }
 
 std::shared_ptr<const Shape> DecodeDynamicShape(std::string_view bytes) {

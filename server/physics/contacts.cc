@@ -28,10 +28,14 @@ void Contacts::Find(Pair& pair, std::vector<Manifold>* out) {
     if (pair.contacts.empty()) pair.contacts.emplace_back();
     Touch(pair, &pair.contacts.front(), pair.a->rigid.getWorldTransform(), pair.b->rigid.getWorldTransform());
   }
+  const size_t before = out->size();
+  pair.touches = true;
   List(pair, out);
+  pair.touches = out->size() > before;
 }
 
 void Contacts::List(const Pair& pair, std::vector<Manifold>* out) const {
+  if (!pair.touches) return;
   for (const PartContact& c : pair.contacts) {
     found_.resize(0);
     c.algorithm->getAllContactManifolds(found_);
@@ -102,6 +106,7 @@ void Contacts::Free(PartContact* contact) {
 void Contacts::Release(Pair& pair) {
   for (PartContact& c : pair.contacts) Free(&c);
   pair.contacts.clear();
+  pair.touches = false;
 }
 
 btPersistentManifold* Contacts::Create(Pair& pair, uint32_t part_a, uint32_t part_b) {
@@ -121,6 +126,7 @@ btPersistentManifold* Contacts::Create(Pair& pair, uint32_t part_a, uint32_t par
                 static_cast<unsigned long long>(pair.a->id), static_cast<unsigned long long>(pair.b->id), part_a,
                 part_b, found_.size());
   found_[0]->clearManifold();
+  pair.touches = true;
   return found_[0];
 }
 

@@ -5,6 +5,7 @@
 #include <tuple>
 
 #include <absl/container/flat_hash_map.h>
+#include <absl/container/flat_hash_set.h>
 #include <absl/strings/str_cat.h>
 
 #include "server/core/check.h"
@@ -204,12 +205,12 @@ Pair* FindPair(const Body& a, const Body& b) {
 
 }  // namespace
 
-std::string SaveState(const BulletWorld& world, std::span<const BodyId> ids) {
+void SaveState(const BulletWorld& world, std::span<const BodyId> ids, std::string* bytes) {
   std::vector<const Body*> bodies;
-  absl::flat_hash_map<const Body*, bool> chosen;
+  absl::flat_hash_set<const Body*> chosen;
   for (BodyId id : ids) {
     bodies.push_back(world.Find(id));
-    chosen[bodies.back()] = true;
+    chosen.insert(bodies.back());
   }
   const auto need = [&](const Body* body, const Body* partner, const char* why) {
     AUREOLE_CHECK(partner == nullptr || !partner->dynamic() || chosen.contains(partner),
@@ -217,7 +218,7 @@ std::string SaveState(const BulletWorld& world, std::span<const BodyId> ids) {
                   static_cast<unsigned long long>(partner->id));
   };
 
-  ByteWriter out;
+  ByteWriter out(bytes);
   out.Put(kMagic);
   out.Put(kVersion);
   out.Put(world.tick());
@@ -252,10 +253,10 @@ std::string SaveState(const BulletWorld& world, std::span<const BodyId> ids) {
     for (const Pair* p : b->pairs) {
       const Body* other = p->Other(b);
       if (!BoxesOverlap(*p->a, *p->b)) continue;  // what they hold is about to be freed
+      if (other->dynamic() && other->id < b->id && chosen.contains(other)) continue;  // once is enough
       found.clear();
       world.contacts().List(*p, &found);
       if (!found.empty()) need(b, other, "contact");
-      if (other->dynamic() && other->id < b->id) continue;
       for (const Manifold& m : found) touching.push_back({p->a->id, p->b->id, m});
     }
   }
@@ -273,7 +274,6 @@ std::string SaveState(const BulletWorld& world, std::span<const BodyId> ids) {
     out.Put(static_cast<uint8_t>(m.getNumContacts()));
     for (int i = 0; i < m.getNumContacts(); ++i) PutPoint(m.getContactPoint(i), &out);
   }
-  return out.Take();
 }
 
 absl::Status RestoreState(std::string_view bytes, BulletWorld* world) {

@@ -14,7 +14,7 @@
 namespace aureole::physics {
 
 // Precondition: `ids` ascend, are here, and are closed under joints and contacts; else the process stops.
-std::string SaveState(const BulletWorld& world, std::span<const BodyId> ids);
+void SaveState(const BulletWorld& world, std::span<const BodyId> ids, std::string* out);
 
 // InvalidArgument names what is wrong; then nothing has changed.
 absl::Status RestoreState(std::string_view bytes, BulletWorld* world);

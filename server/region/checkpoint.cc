@@ -1,5 +1,7 @@
 #include "server/region/checkpoint.h"
 
+#include <utility>
+
 #include <absl/strings/str_cat.h>
 
 #include "server/core/archive.h"
@@ -23,8 +25,10 @@ void VisitCheckpoint(Archive& a, Checkpoint& c) {
 
 }  // namespace
 
-Checkpoint TakeCheckpoint(uint64_t world_hash, const Region& region, const RegionLinks& links) {
-  Checkpoint out{world_hash, region.self(), region.tick(), region.Save(), links.States(), {}};
+Checkpoint TakeCheckpoint(uint64_t world_hash, const Region& region, const RegionLinks& links, std::string room) {
+  room.clear();
+  region.SaveTo(&room);
+  Checkpoint out{world_hash, region.self(), region.tick(), std::move(room), links.States(), {}};
   for (RegionId peer : region.peers()) out.links.at(peer).applied = region.FramesTaken(peer);
   return out;
 }

@@ -38,8 +38,9 @@ struct Checkpoint {
   std::vector<Hash> hashes;  // of the ticks just before, which may not have been reported
 };
 
-// Of a region after a tick, at the beginning of the next or when it has left.
-Checkpoint TakeCheckpoint(uint64_t world_hash, const Region& region, const RegionLinks& links);
+// Of a region after a tick, at the beginning of the next or when it has left. `room`: what it held is lost, and its
+// memory is used, which is much faster than new memory.
+Checkpoint TakeCheckpoint(uint64_t world_hash, const Region& region, const RegionLinks& links, std::string room = {});
 
 // With a check sum. Linear; tens of megabytes for the largest regions, so not for the tick thread.
 std::string EncodeCheckpoint(const Checkpoint& checkpoint);

@@ -407,6 +407,11 @@ void Journal::Write(Checkpoint checkpoint, RegionId keeper) {
   WriteNext(std::move(next));
 }
 
+std::string Journal::TakeRoom() {
+  const std::lock_guard lock(mutex_);
+  return std::exchange(room_, {});
+}
+
 void Journal::WriteEncoded(Tick tick, std::string checkpoint) {
   ToWrite next;
   next.tick = tick;
@@ -435,7 +440,12 @@ void Journal::WriteCheckpoints() {
     const auto began = std::chrono::steady_clock::now();
     if (next.checkpoint.has_value()) {
       next.encoded = std::make_shared<const std::string>(EncodeCheckpoint(*next.checkpoint));
+      std::string room = std::move(next.checkpoint->state);
       next.checkpoint.reset();
+      {
+        const std::lock_guard again(mutex_);
+        room_ = std::move(room);
+      }
       if (copy_ != nullptr) copy_->Ship(next.tick, next.encoded);
     }
     const absl::Status s = Store(*next.encoded);

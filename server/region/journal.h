@@ -109,6 +109,8 @@ class Journal {
   bool fenced() const;
   // Whether a checkpoint is still being written.
   bool writing() const;
+  // The memory of the last state that was written, for the next one.
+  std::string TakeRoom();
   // Precondition: none is being written. `keeper`: where it is copied to from here on.
   void Write(Checkpoint checkpoint, RegionId keeper = kNoRegion);
   // The same, as EncodeCheckpoint has it; nothing is copied.
@@ -160,6 +162,7 @@ class Journal {
   bool stopped_ = false;
   std::optional<ToWrite> to_write_;
   bool writing_ = false;
+  std::string room_;
   std::deque<std::pair<Tick, Used>> durable_;  // that were not taken
   std::string records_;                        // not yet written
   Tick logged_tick_ = 0;

@@ -72,6 +72,10 @@ bool TickLoop::Run() {
     if (!RunTick()) break;
     AfterTick();
     if (Clock::now() - reported_at_ >= kReportEvery || pending_.windows_size() > 0) Report({}, false);
+    if (journal_ != nullptr) {  // when nobody waits for this region's frames
+      TellDurable();
+      Checkpoint(options_.checkpoint_every);
+    }
   }
   EndLap();
   if (left() && !done()) Leave();
@@ -153,10 +157,6 @@ bool TickLoop::SleepUntilDue(Tick n) {
 
 bool TickLoop::RunTick() {
   const Tick n = region_->tick() + 1;
-  if (journal_ != nullptr) {
-    TellDurable();
-    Checkpoint(options_.checkpoint_every);
-  }
   OfferInputs();
   // An input that this one has logged in vain the later one may have found, and will tell in this tick.
   if (journal_ != nullptr && journal_->fenced()) {
@@ -222,7 +222,7 @@ void TickLoop::TellDurable() {
 void TickLoop::Checkpoint(Tick after) {
   if (region_->tick() < checkpointed_ + after || journal_->writing()) return;
   const Clock::time_point since = Clock::now();
-  aureole::Checkpoint checkpoint = TakeCheckpoint(options_.world_hash, *region_, *links_);
+  aureole::Checkpoint checkpoint = TakeCheckpoint(options_.world_hash, *region_, *links_, journal_->TakeRoom());
   const size_t kept = std::min(recent_hashes_.size(), kCheckpointHashes);
   checkpoint.hashes.assign(recent_hashes_.end() - static_cast<std::ptrdiff_t>(kept), recent_hashes_.end());
   journal_->Write(std::move(checkpoint), KeeperOf(region_->self(), region_->members()));

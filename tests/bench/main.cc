@@ -4,6 +4,7 @@
 
 #include <CLI/CLI.hpp>
 
+#include "tests/bench/checkpoint_cost.h"
 #include "tests/bench/client_bytes.h"
 #include "tests/bench/fan_out.h"
 #include "tests/bench/overhead.h"
@@ -25,6 +26,16 @@ void PrintOverhead(const OverheadOptions& options, bool json) {
              "; %d blocks of %d ticks each\nstate hash %016" PRIx64 "\n";
   std::printf(format, r.ratio_median, r.ratio_low, r.ratio_high, r.region_ms, r.stock_ms, options.bodies,
               r.region_contacts, r.stock_contacts, options.blocks, options.block, r.state_hash);
+}
+
+void PrintCheckpointCost(const CheckpointCostOptions& options, bool json) {
+  const CheckpointCostResult r = MeasureCheckpointCost(options);
+  std::printf(
+      json ? "{\"pause_ms\": %.4f, \"longest_ms\": %.4f, \"tick_ms\": %.4f, \"kilobytes\": %.1f, \"bodies\": %d, "
+             "\"contacts\": %" PRId64 ", \"state_hash\": \"%016" PRIx64 "\"}\n"
+           : "taking a checkpoint: %.3f ms of the tick thread's CPU, at most %.3f; a tick: %.3f ms\n"
+             "%.0f kB; %d awake bodies, %" PRId64 " contact points\nstate hash %016" PRIx64 "\n",
+      r.pause_ms, r.longest_ms, r.tick_ms, r.kilobytes, options.bodies, r.contacts, r.state_hash);
 }
 
 void PrintClientBytes(const ClientBytesOptions& options, bool json) {
@@ -120,6 +131,11 @@ int Run(int argc, char** argv) {
   bytes->add_flag("--json", json, "One JSON object instead of text");
   bytes->add_option("--bodies", bytes_options.bodies, "Bodies of a scene")->check(CLI::Range(1, 100000));
   bytes->add_option("--ticks", bytes_options.ticks, "Measured ticks of a scene")->check(CLI::Range(60, 1000000));
+  CheckpointCostOptions checkpoint_options;
+  CLI::App* checkpoint = app.add_subcommand("checkpoint", "What taking a checkpoint costs the tick thread.");
+  checkpoint->add_flag("--json", json, "One JSON object instead of text");
+  checkpoint->add_option("--bodies", checkpoint_options.bodies, "Awake bodies")->check(CLI::Range(1, 100000));
+  checkpoint->add_option("--checkpoints", checkpoint_options.checkpoints, "Checkpoints")->check(CLI::Range(1, 100000));
   FanOutOptions fan_out_options;
   CLI::App* fan_out = app.add_subcommand("fan-out", "Clients that share one view, on real processes.");
   fan_out->add_flag("--json", json, "One JSON object instead of text");
@@ -150,6 +166,7 @@ int Run(int argc, char** argv) {
   CLI11_PARSE(app, argc, argv);
   if (recovery->parsed()) return PrintRecovery(recovery_options, json);
   if (overhead->parsed()) PrintOverhead(overhead_options, json);
+  if (checkpoint->parsed()) PrintCheckpointCost(checkpoint_options, json);
   if (bytes->parsed()) PrintClientBytes(bytes_options, json);
   if (view->parsed()) PrintViewCost(view_options, json);
   if (stopped->parsed()) return PrintStopped(stopped_options, json);

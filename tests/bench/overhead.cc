@@ -1,9 +1,6 @@
 #include "tests/bench/overhead.h"
 
-#include <ctime>
-
 #include <algorithm>
-#include <cmath>
 #include <memory>
 #include <utility>
 #include <vector>
@@ -11,77 +8,19 @@
 #include "server/core/region.h"
 #include "server/physics/bullet_engine.h"
 #include "server/physics/plain_bullet_world.h"
+#include "tests/bench/heap_world.h"
 #include "tests/bench/quantile.h"
+#include "tests/bench/thread_time.h"
 
 namespace aureole {
 namespace {
 
-double ThreadSeconds() {
-  timespec t;
-  clock_gettime(CLOCK_THREAD_CPUTIME_ID, &t);
-  return static_cast<double>(t.tv_sec) + static_cast<double>(t.tv_nsec) * 1e-9;
-}
-
-std::shared_ptr<const Shape> MakeShape(int i) {
-  auto s = std::make_shared<Shape>();
-  const double size = 0.3 + 0.02 * (i % 7);
-  switch (i % 3) {
-    case 0:
-      s->kind = ShapeKind::kSphere;
-      s->radius = size;
-      break;
-    case 1:
-      s->kind = ShapeKind::kBox;
-      s->half = Vec3(size, 0.8 * size, 1.2 * size);
-      break;
-    default:
-      s->kind = ShapeKind::kCapsule;
-      s->radius = 0.7 * size;
-      s->half.y() = 1.5 * size;
-  }
-  return s;
-}
-
-BodySpec Fixed(BodyId id, std::shared_ptr<const Shape> shape, const Vec3& position) {
-  BodySpec b;
-  b.id = id;
-  b.motion = Motion::kStatic;
-  b.shape = std::move(shape);
-  b.position = position;
-  return b;
-}
-
-// Bodies fall into a pit of 9 m by 9 m; nothing sleeps.
-World Heap(int bodies) {
-  World world(Layout::Columns({}).value());
-  world.environment.sleep_linear = 0;
-  auto plane = std::make_shared<Shape>();
-  plane->kind = ShapeKind::kPlane;
-  world.environment.fixed.push_back(Fixed(1, plane, Vec3::Zero()));
-  for (int wall = 0; wall < 4; ++wall) {
-    auto box = std::make_shared<Shape>();
-    box->kind = ShapeKind::kBox;
-    box->half = wall < 2 ? Vec3(0.5, 10, 6) : Vec3(6, 10, 0.5);
-    const double at = wall % 2 == 0 ? -5 : 5;
-    world.environment.fixed.push_back(
-        Fixed(2 + static_cast<BodyId>(wall), box, wall < 2 ? Vec3(at, 10, 0) : Vec3(0, 10, at)));
-  }
-  for (int i = 0; i < bodies; ++i) {
-    BodySpec b;
-    b.id = 1000 + static_cast<BodyId>(i);
-    b.shape = MakeShape(i);
-    b.mass = 1 + 0.1 * (i % 11);
-    b.position = Vec3(-3.6 + 1.2 * (i % 7), 1 + 1.1 * (i / 49), -3.6 + 1.2 * (i / 7 % 7));
-    b.orientation = Quat(Eigen::AngleAxisd(0.1 * i, Vec3(1, 2, 3).normalized()));
-    world.bodies.push_back(std::move(b));
-  }
-  return world;
-}
-
 class Race {
  public:
   explicit Race(int bodies)
-      : world_(Heap(bodies)), region_(world_, 0, MakeBulletEngine(world_.environment)), stock_(world_.environment) {
+      : world_(HeapWorld(bodies)),
+        region_(world_, 0, MakeBulletEngine(world_.environment)),
+        stock_(world_.environment) {
     for (const BodySpec& b : world_.bodies) stock_.Spawn(b);
   }
 
