@@ -45,7 +45,13 @@ class Start(WorldTest):
             for container in pod["spec"]["containers"]:
                 self.assertTrue(container["securityContext"]["readOnlyRootFilesystem"])
                 self.assertNotIn("cpu", container.get("resources", {}).get("limits", {}))
-        self.assertGreater(len({p["spec"]["nodeName"] for p in found}), 1, "they are spread over the nodes")
+
+    def test_regions_are_spread_over_the_nodes(self):
+        on = {n["metadata"]["name"]: 0 for n in get("nodes", space=None)["items"] if not n["spec"].get("taints")}
+        for pod in self.world.pods():
+            on[pod["spec"]["nodeName"]] += 1
+        self.measure("regions of nodes", "/".join(str(n) for n in sorted(on.values(), reverse=True)), unit="")
+        self.assertLessEqual(max(on.values()) - min(on.values()), 1, on)
 
     def test_clients_of_any_server_see_every_body(self):
         self.world.ticks.goes_on()

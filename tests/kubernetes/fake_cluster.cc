@@ -43,6 +43,32 @@ Json ContainerState(const Json& state) {
   return {{"containerStatuses", Json::array({{{"name", "region"}, {"state", state}}})}};
 }
 
+bool Selects(const Json& selector, const Json& pod) {
+  const Json labels = pod["metadata"].value("labels", Json::object());
+  const Json exact = selector.value("matchLabels", Json::object());
+  const Json in = selector.value("matchExpressions", Json::array());
+  for (const auto& [key, value] : exact.items()) {
+    if (labels.value(key, "") != value) return false;
+  }
+  return std::all_of(in.begin(), in.end(), [&](const Json& term) {
+    const Json& values = term["values"];
+    return std::find(values.begin(), values.end(), labels.value(TextAt(term, {"key"}), "")) != values.end();
+  });
+}
+
+// How much the Pod prefers to be where the other one is.
+int Likes(const Json& pod, const Json& other) {
+  int sum = 0;
+  for (const auto& [kind, sign] : {std::pair("podAffinity", 1), std::pair("podAntiAffinity", -1)}) {
+    const Json* const terms = Find(pod, {"spec", "affinity", kind, "preferredDuringSchedulingIgnoredDuringExecution"});
+    if (terms == nullptr) continue;
+    for (const Json& term : *terms) {
+      if (Selects(term["podAffinityTerm"]["labelSelector"], other)) sum += sign * term["weight"].get<int>();
+    }
+  }
+  return sum;
+}
+
 // Signals that are blocked, and handlers, are inherited: children begin with none.
 [[noreturn]] void RunChild(char* const* words, char* const* environment, int log, pid_t parent) {
   prctl(PR_SET_PDEATHSIG, SIGKILL);
@@ -220,7 +246,7 @@ void FakeCluster::Run(const std::stop_token& stop) {
       if (TextAt(pod, {"metadata", "labels", kWorldLabel}).empty()) continue;
       const std::string path = absl::StrCat(kPods, "/", TextAt(pod, {"metadata", "name"}));
       if (TextAt(pod, {"spec", "nodeName"}).empty()) {
-        Schedule(path, round++);
+        Schedule(path, pod, round++);
       } else {
         Tend(path, pod);
       }
@@ -229,16 +255,27 @@ void FakeCluster::Run(const std::stop_token& stop) {
   }
 }
 
-void FakeCluster::Schedule(const std::string& path, int round) {
-  std::vector<std::string> there;
+// Every node is a zone of its own.
+void FakeCluster::Schedule(const std::string& path, const Json& pod, int round) {
+  std::map<std::string, int> scores;
   {
     const std::lock_guard lock(mutex_);
     for (const auto& [node, up] : nodes_) {
-      if (up) there.push_back(node);
+      if (up) scores[node] = 0;
     }
   }
-  if (there.empty()) return;
-  api_.Merge(path, {{"spec", {{"nodeName", there[static_cast<size_t>(round) % there.size()]}}}});
+  for (const Json& other : api_.All(kPods)) {
+    const auto score = scores.find(TextAt(other, {"spec", "nodeName"}));
+    if (score == scores.end() || other["metadata"].contains("deletionTimestamp")) continue;
+    score->second += Likes(pod, other) + Likes(other, pod);
+  }
+  std::vector<std::string> best;
+  for (const auto& [node, score] : scores) {
+    if (!best.empty() && score > scores[best.front()]) best.clear();
+    if (best.empty() || score == scores[best.front()]) best.push_back(node);
+  }
+  if (best.empty()) return;
+  api_.Merge(path, {{"spec", {{"nodeName", best[static_cast<size_t>(round) % best.size()]}}}});
 }
 
 void FakeCluster::Tend(const std::string& path, const Json& pod) {

@@ -88,14 +88,26 @@ TEST(PodManifest, TakesOverWhatTheWorldSays) {
   EXPECT_EQ(spec["containers"][0]["volumeMounts"].back(), pods.mounts[0]);
 }
 
-TEST(PodManifest, NeighboursAreCloseAndSpread) {
-  const Json near = PodManifest(Template(), {0, 1, "", ""})["spec"]["affinity"];
-  const Json& zone = near["podAffinity"]["preferredDuringSchedulingIgnoredDuringExecution"][0]["podAffinityTerm"];
-  EXPECT_EQ(zone["topologyKey"], "topology.kubernetes.io/zone");
-  EXPECT_EQ(zone["labelSelector"]["matchLabels"], (Json{{"aureole.dev/world", "demo"}}));
-  EXPECT_EQ(zone["labelSelector"]["matchExpressions"][0]["values"], (Json{"1", "2"}));
-  const Json& host = near["podAntiAffinity"]["preferredDuringSchedulingIgnoredDuringExecution"][0]["podAffinityTerm"];
-  EXPECT_EQ(host["topologyKey"], "kubernetes.io/hostname");
+TEST(PodManifest, RegionsAreSpreadOverHostsFirstAndNeighboursAreClose) {
+  const Json spec = PodManifest(Template(), {0, 1, "", ""})["spec"];
+  const auto weighed = [&spec](const char* kind) {
+    return spec["affinity"][kind]["preferredDuringSchedulingIgnoredDuringExecution"][0];
+  };
+  const Json near = weighed("podAffinity"), apart = weighed("podAntiAffinity");
+  const Json world = {{"aureole.dev/world", "demo"}};
+  EXPECT_EQ(near["podAffinityTerm"]["topologyKey"], "topology.kubernetes.io/zone");
+  EXPECT_EQ(near["podAffinityTerm"]["labelSelector"]["matchLabels"], world);
+  EXPECT_EQ(near["podAffinityTerm"]["labelSelector"]["matchExpressions"][0]["values"], (Json{"1", "2"}));
+  EXPECT_EQ(apart["podAffinityTerm"]["topologyKey"], "kubernetes.io/hostname");
+  EXPECT_EQ(apart["podAffinityTerm"]["labelSelector"], (Json{{"matchLabels", world}}));
+  // Also where each host is a zone, and all 8 neighbours of a region of a grid are on it.
+  EXPECT_GT(apart["weight"].get<int>(), 8 * near["weight"].get<int>());
+  EXPECT_GT(near["weight"].get<int>(), 0);
+  const Json spread = {{"maxSkew", 1},
+                       {"topologyKey", "kubernetes.io/hostname"},
+                       {"whenUnsatisfiable", "ScheduleAnyway"},
+                       {"labelSelector", {{"matchLabels", world}}}};
+  EXPECT_EQ(spec["topologySpreadConstraints"], Json::array({spread}));
   EXPECT_FALSE(PodManifest(Template(), {3, 1, "", ""})["spec"]["affinity"].contains("podAffinity"));
 }
 

@@ -136,6 +136,13 @@ TEST_F(WorldLife, RunsToItsEndAndSaysSo) {
   EXPECT_TRUE(Await([&] { return HasEvent("Running") && HasEvent("Finished"); }));
 }
 
+TEST_F(WorldLife, RegionsRunOnDifferentNodesThoughTheyAreNeighbours) {
+  cluster_.StartControl(0);
+  Create(Spec());
+  ASSERT_TRUE(AwaitTick(10));
+  EXPECT_NE(TextAt(Status()["regions"][0], {"node"}), TextAt(Status()["regions"][1], {"node"}));
+}
+
 TEST_F(WorldLife, DeletedPodIsReplaced) {
   cluster_.StartControl(0);
   Create(Spec());

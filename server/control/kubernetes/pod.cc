@@ -11,7 +11,10 @@ namespace {
 
 constexpr char kServer[] = "aureole-region", kData[] = "/data";
 constexpr int kUser = 65532, kGraceSeconds = 30;
-constexpr int kNear = 100, kApart = 50;  // of 100, for the scheduler to weigh
+// For the scheduler to weigh. Machines come first: one Pod more on a machine weighs more than all neighbours in its
+// zone, of which a grid has 8.
+constexpr int kApart = 100, kNear = 10;
+constexpr char kHost[] = "kubernetes.io/hostname", kZone[] = "topology.kubernetes.io/zone";
 
 Json Labels(const PodTemplate& pods, const ServerStart& start) {
   return {{"app.kubernetes.io/name", kServer},
@@ -39,16 +42,23 @@ Json Affinity(const PodTemplate& pods, RegionId region) {
     return Json{{"preferredDuringSchedulingIgnoredDuringExecution",
                  Json::array({{{"weight", weight}, {"podAffinityTerm", term}}})}};
   };
-  Json affinity = {{"podAntiAffinity", weigh("kubernetes.io/hostname", nullptr, kApart)}};
+  Json affinity = {{"podAntiAffinity", weigh(kHost, nullptr, kApart)}};
   Json neighbours = Json::array();
   if (static_cast<size_t>(region) < pods.neighbours.size()) {
     for (const RegionId r : pods.neighbours[static_cast<size_t>(region)]) neighbours.push_back(absl::StrCat(r));
   }
   if (!neighbours.empty()) {
-    affinity["podAffinity"] = weigh("topology.kubernetes.io/zone",
-                                    {{"key", kRegionLabel}, {"operator", "In"}, {"values", neighbours}}, kNear);
+    affinity["podAffinity"] = weigh(kZone, {{"key", kRegionLabel}, {"operator", "In"}, {"values", neighbours}}, kNear);
   }
   return affinity;
+}
+
+// The weights above are held against each other only; this one counts against how full machines are, too.
+Json Spread(const PodTemplate& pods) {
+  return Json::array({{{"maxSkew", 1},
+                       {"topologyKey", kHost},
+                       {"whenUnsatisfiable", "ScheduleAnyway"},
+                       {"labelSelector", {{"matchLabels", {{kWorldLabel, pods.world}}}}}}});
 }
 
 // A host's directory is shared by all that is on the host, so the region has one of its own in it.
@@ -164,6 +174,7 @@ Json PodManifest(const PodTemplate& pods, const ServerStart& start) {
                  {"fsGroup", kUser},
                  {"seccompProfile", {{"type", "RuntimeDefault"}}}}},
                {"affinity", Affinity(pods, start.region)},
+               {"topologySpreadConstraints", Spread(pods)},
                {"volumes", Appended(volumes, pods.volumes)},
                {"containers", Json::array({Container(pods, start)})}};
   if (!pods.service_account.empty()) spec["serviceAccountName"] = pods.service_account;

@@ -39,8 +39,8 @@ struct PodTemplate {
 std::string PodName(const std::string& world, RegionId region, uint64_t incarnation);
 std::string ClaimName(const std::string& world, RegionId region);
 
-// One Pod per server, ended for good when the server ends. Near its region's neighbours, but not with them on one
-// machine, where there is the choice.
+// One Pod per server, ended for good when the server ends. Where there is the choice: on a machine that has fewer of
+// the world's Pods than others, and of those in the zone of its region's neighbours.
 Json PodManifest(const PodTemplate& pods, const ServerStart& start);
 // Of the region's storage, which goes with the World; nothing when it needs none.
 std::optional<Json> ClaimManifest(const PodTemplate& pods, RegionId region);
