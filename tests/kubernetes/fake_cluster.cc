@@ -69,6 +69,19 @@ int Likes(const Json& pod, const Json& other) {
   return sum;
 }
 
+// Whether it must not be on the node.
+bool Avoids(const Json& pod, const std::string& node) {
+  const Json* const terms = Find(
+      pod, {"spec", "affinity", "nodeAffinity", "requiredDuringSchedulingIgnoredDuringExecution", "nodeSelectorTerms"});
+  if (terms == nullptr) return false;
+  const Json& fields = terms->front()["matchFields"];
+  return std::any_of(fields.begin(), fields.end(), [&](const Json& field) {
+    AUREOLE_CHECK(field["key"] == "metadata.name" && field["operator"] == "NotIn" && field["values"].size() == 1,
+                  "the real one refuses %s", field.dump().c_str());
+    return field["values"][0] == node;
+  });
+}
+
 // Signals that are blocked, and handlers, are inherited: children begin with none.
 [[noreturn]] void RunChild(char* const* words, char* const* environment, int log, pid_t parent) {
   prctl(PR_SET_PDEATHSIG, SIGKILL);
@@ -89,7 +102,7 @@ FakeCluster::FakeCluster(int nodes) {
   std::string name = (std::filesystem::temp_directory_path() / "cluster.XXXXXX").string();
   directory_ = mkdtemp(name.data());
   std::filesystem::create_directories(disk());
-  for (int i = 1; i <= nodes; ++i) nodes_[absl::StrCat("n", i)] = true;
+  for (int i = 1; i <= nodes; ++i) nodes_[absl::StrCat("n", i)] = Node::kThere;
   // Tests run at the same time; the test process' number keeps them apart.
   subnet_ = absl::StrCat("127.", 64 + getpid() % 128, ".", getpid() / 128 % 256, ".");
   service_ = Address();
@@ -221,9 +234,9 @@ size_t FakeCluster::processes() {
       std::count_if(containers_.begin(), containers_.end(), [](const auto& entry) { return entry.second.pid > 0; }));
 }
 
-void FakeCluster::LoseNode(const std::string& node, bool processes_go_on) {
+void FakeCluster::LoseNode(const std::string& node, bool processes_go_on, bool cluster_knows) {
   const std::lock_guard lock(mutex_);
-  nodes_[node] = false;
+  nodes_[node] = cluster_knows ? Node::kLost : Node::kSilent;
   for (auto& [uid, container] : containers_) {
     if (container.node == node && container.pid > 0 && !processes_go_on) kill(container.pid, SIGKILL);
   }
@@ -260,8 +273,8 @@ void FakeCluster::Schedule(const std::string& path, const Json& pod, int round) 
   std::map<std::string, int> scores;
   {
     const std::lock_guard lock(mutex_);
-    for (const auto& [node, up] : nodes_) {
-      if (up) scores[node] = 0;
+    for (const auto& [node, state] : nodes_) {
+      if (state != Node::kLost && !Avoids(pod, node)) scores[node] = 0;
     }
   }
   for (const Json& other : api_.All(kPods)) {
@@ -274,14 +287,19 @@ void FakeCluster::Schedule(const std::string& path, const Json& pod, int round) 
     if (!best.empty() && score > scores[best.front()]) best.clear();
     if (best.empty() || score == scores[best.front()]) best.push_back(node);
   }
-  if (best.empty()) return;
+  if (best.empty()) {
+    if (ReadPod(pod)->unschedulable) return;
+    const Json condition = {{"type", "PodScheduled"}, {"status", "False"}, {"message", "no node is available"}};
+    api_.Merge(path, {{"status", {{"phase", "Pending"}, {"conditions", Json::array({condition})}}}});
+    return;
+  }
   api_.Merge(path, {{"spec", {{"nodeName", best[static_cast<size_t>(round) % best.size()]}}}});
 }
 
 void FakeCluster::Tend(const std::string& path, const Json& pod) {
   const std::string uid = TextAt(pod, {"metadata", "uid"}), node = TextAt(pod, {"spec", "nodeName"});
   std::unique_lock lock(mutex_);
-  if (!nodes_[node]) return;
+  if (nodes_[node] != Node::kThere) return;
   const bool leaving = pod["metadata"].contains("deletionTimestamp");
   if (!containers_.contains(uid)) {
     lock.unlock();

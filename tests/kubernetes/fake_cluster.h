@@ -41,12 +41,14 @@ class FakeCluster {
   pid_t ProcessOf(const std::string& pod);
   size_t processes();  // of Pods, that run
 
-  // The node says and does nothing any more; its processes go on, or not.
-  void LoseNode(const std::string& node, bool processes_go_on);
+  // The node says and does nothing any more; its processes go on, or not. While the cluster does not know, the
+  // scheduler takes the node for one like any other.
+  void LoseNode(const std::string& node, bool processes_go_on, bool cluster_knows = true);
   // What everything wrote, for a test that fails.
   std::string Logs() const;
 
  private:
+  enum class Node : uint8_t { kThere, kSilent, kLost };  // silent: the cluster does not know yet
   struct Container {
     std::string node, log;
     pid_t pid = -1;
@@ -75,7 +77,7 @@ class FakeCluster {
   int listener_ = -1;
 
   std::mutex mutex_;
-  std::map<std::string, bool> nodes_;            // whether they are there
+  std::map<std::string, Node> nodes_;
   std::map<std::string, Container> containers_;  // by the Pod's uid
   std::map<std::string, std::string> uid_of_;    // by the Pod's name
   std::map<int, Control> controls_;

@@ -154,6 +154,87 @@ TEST_F(PodAllocatorTest, PodThatCannotBeScheduledIsAnEndAfterAWhile) {
   EXPECT_TRUE(Await([&] { return !server_.At(PathOf(0, 1)); }));
 }
 
+Json Avoided(const Json& pod) {
+  Json nodes = Json::array();
+  const Json* const terms = Find(
+      pod, {"spec", "affinity", "nodeAffinity", "requiredDuringSchedulingIgnoredDuringExecution", "nodeSelectorTerms"});
+  if (terms == nullptr) return nodes;
+  for (const Json& field : terms->front()["matchFields"]) nodes.push_back(field["values"][0]);
+  return nodes;
+}
+
+TEST_F(PodAllocatorTest, PodsAvoidTheNodeOfALostServerForAWhile) {
+  PodAllocator::Options options = TestOptions();
+  options.avoid_for = milliseconds(500);
+  Open(options);
+  Run(0, 1);
+  Run(1, 1);
+  server_.Merge(PathOf(1, 1), {{"spec", {{"nodeName", "n2"}}}});
+  ASSERT_TRUE(Await([&] { return allocator_->Newest()[0].started && allocator_->Newest()[1].node == "n2"; }));
+  server_.Merge(PathOf(1, 1), Exited(1, "Error"));
+  EXPECT_EQ(AwaitExit().region, 1);
+  Run(1, 2);
+  EXPECT_EQ(Avoided(*server_.At(PathOf(1, 2))), Json::array()) << "n2 has said that it ended";
+  allocator_->End(0, 1);
+  Run(0, 2);
+  Run(1, 3);
+  EXPECT_EQ(Avoided(*server_.At(PathOf(0, 2))), Json({"n1"}));
+  EXPECT_EQ(Avoided(*server_.At(PathOf(1, 3))), Json({"n1"})) << "whichever region";
+  std::this_thread::sleep_for(options.avoid_for);
+  Run(0, 3);
+  EXPECT_EQ(Avoided(*server_.At(PathOf(0, 3))), Json::array());
+}
+
+const Json kBoundOnly = {
+    {"spec", {{"nodeName", "n1"}}},
+    {"status", {{"phase", "Pending"}, {"conditions", Json::array({{{"type", "PodScheduled"}, {"status", "True"}}})}}}};
+
+TEST_F(PodAllocatorTest, PodThatItsNodeDoesNotTakeIsForgottenAndTheNodeAvoided) {
+  PodAllocator::Options options = TestOptions();
+  options.take_patience = milliseconds(300);
+  Open(options);
+  for (const int region : {0, 1}) {
+    ASSERT_TRUE(allocator_->Start(StartOf(region, 1)).ok());
+    ASSERT_TRUE(AwaitPod(region, 1));
+  }
+  Json taken = kBoundOnly;
+  taken["status"]["startTime"] = "2026-01-01T00:00:00Z";  // it pulls the image, say
+  server_.Merge(PathOf(1, 1), taken);
+  server_.Merge(PathOf(0, 1), kBoundOnly);
+  const ServerExit exit = AwaitExit();
+  EXPECT_EQ(exit.region, 0);
+  EXPECT_EQ(exit.how, "node lost: n1 has not taken note of its Pod within 0.3 s");
+  EXPECT_TRUE(Await([&] { return !server_.At(PathOf(0, 1)); })) << "it waits for the node";
+  ASSERT_TRUE(allocator_->Start(StartOf(0, 2)).ok());
+  ASSERT_TRUE(AwaitPod(0, 2));
+  EXPECT_EQ(Avoided(*server_.At(PathOf(0, 2))), Json({"n1"}));
+  EXPECT_TRUE(allocator_->Poll().empty());
+  EXPECT_EQ(allocator_->running(), 2);
+}
+
+TEST_F(PodAllocatorTest, WhatHasNoOtherPlaceMayRunOnAnAvoidedNode) {
+  PodAllocator::Options options = TestOptions();
+  options.take_patience = options.avoid_patience = milliseconds(300);
+  options.start_patience = milliseconds(2000);
+  Open(options);
+  Run(0, 1);
+  ASSERT_TRUE(Await([&] { return allocator_->Newest()[0].started; }));
+  allocator_->End(0, 1);
+  AwaitExit();
+  ASSERT_TRUE(allocator_->Start(StartOf(0, 2)).ok());
+  ASSERT_TRUE(AwaitPod(0, 2));
+  EXPECT_EQ(Avoided(*server_.At(PathOf(0, 2))), Json({"n1"}));
+  const Json condition = {{"type", "PodScheduled"}, {"status", "False"}, {"message", "0/1 nodes are available."}};
+  server_.Merge(PathOf(0, 2), {{"status", {{"phase", "Pending"}, {"conditions", Json::array({condition})}}}});
+  EXPECT_EQ(AwaitExit().how, "cannot be scheduled: 0/1 nodes are available.; the next one may run where one was lost");
+  EXPECT_TRUE(Await([&] { return !server_.At(PathOf(0, 2)); }));
+  ASSERT_TRUE(allocator_->Start(StartOf(0, 3)).ok());
+  ASSERT_TRUE(AwaitPod(0, 3));
+  EXPECT_EQ(Avoided(*server_.At(PathOf(0, 3))), Json::array());
+  server_.Merge(PathOf(0, 3), kBoundOnly);
+  EXPECT_EQ(AwaitExit().how, "has not started within 2 s") << "there is no use in trying again and again";
+}
+
 TEST_F(PodAllocatorTest, EndIsToldAtOnceWhateverItsNodeDoes) {
   Open();
   Run(0, 1);

@@ -111,6 +111,20 @@ TEST(PodManifest, RegionsAreSpreadOverHostsFirstAndNeighboursAreClose) {
   EXPECT_FALSE(PodManifest(Template(), {3, 1, "", ""})["spec"]["affinity"].contains("podAffinity"));
 }
 
+TEST(PodManifest, NodesThatAreAvoidedAreExcludedByName) {
+  Json pod = PodManifest(Template(), kStart, {"n1", "n2"});
+  const Json required = pod["spec"]["affinity"]["nodeAffinity"]["requiredDuringSchedulingIgnoredDuringExecution"];
+  ASSERT_EQ(required["nodeSelectorTerms"].size(), 1u) << "of several, one would do";
+  const Json fields = required["nodeSelectorTerms"][0]["matchFields"];
+  ASSERT_EQ(fields.size(), 2u);
+  EXPECT_EQ(fields[1], (Json{{"key", "metadata.name"}, {"operator", "NotIn"}, {"values", Json::array({"n2"})}}));
+  EXPECT_TRUE(pod["spec"]["affinity"].contains("podAntiAffinity"));
+  EXPECT_TRUE(ReadPod(pod)->avoids);
+  pod = PodManifest(Template(), kStart);
+  EXPECT_FALSE(pod["spec"]["affinity"].contains("nodeAffinity"));
+  EXPECT_FALSE(ReadPod(pod)->avoids);
+}
+
 TEST(PodManifest, VolumeFollowsTheRegion) {
   PodTemplate pods = Template();
   const auto data = [&] { return PodManifest(pods, kStart)["spec"]["volumes"][0]; };
@@ -210,6 +224,26 @@ TEST(ReadPod, SaysWhyItHasNotStarted) {
   EXPECT_TRUE(read(kRunning).started);
   EXPECT_TRUE(read(Terminated(1, "Error")).started);
   EXPECT_FALSE(read(Unschedulable("x")).started);
+  EXPECT_TRUE(read(Unschedulable("x")).unschedulable);
+  EXPECT_FALSE(read({{"phase", "Pending"}}).unschedulable);
+}
+
+TEST(ReadPod, NodeHasTakenItOnceItSaysSomething) {
+  const auto taken = [](const Json& status) {
+    Json pod = PodManifest(Template(), kStart);
+    pod["spec"]["nodeName"] = "n1";
+    pod["status"] = status;
+    return ReadPod(pod)->taken;
+  };
+  const Json scheduled = {{"phase", "Pending"},
+                          {"qosClass", "Burstable"},
+                          {"conditions", Json::array({{{"type", "PodScheduled"}, {"status", "True"}}})}};
+  EXPECT_FALSE(taken(scheduled)) << "that is the scheduler's word";
+  Json pulls = scheduled;
+  pulls["startTime"] = "2026-01-01T00:00:00Z";
+  EXPECT_TRUE(taken(pulls));
+  EXPECT_TRUE(taken(Waiting("ContainerCreating", "")));
+  EXPECT_TRUE(taken(kRunning));
 }
 
 }  // namespace

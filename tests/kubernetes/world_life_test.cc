@@ -182,6 +182,30 @@ TEST_F(WorldLife, LostNodeIsFencedAndItsRegionsRunElsewhere) {
   EXPECT_EQ(TextAt(Status(), {"hash", "hash"}), HashOfTheEnd(seconds_));
 }
 
+// The scheduler finds it as good as any, as it runs less than the others.
+TEST_F(WorldLife, DeadNodeThatTheClusterDoesNotKnowOfGetsNoReplacement) {
+  cluster_.StartControl(0);
+  Create(Spec());
+  ASSERT_TRUE(AwaitTick(100));
+  const std::string node = TextAt(Status()["regions"][0], {"node"});
+  cluster_.LoseNode(node, /*processes_go_on=*/false, /*cluster_knows=*/false);
+  ASSERT_TRUE(Await([&] { return Incarnation(0) >= 2; }));
+  ASSERT_TRUE(Await([&] { return Phase() == "Finished"; }, seconds(30))) << Phase() << " at tick " << Tick();
+  EXPECT_EQ(TextAt(Status(), {"hash", "hash"}), HashOfTheEnd(seconds_));
+  EXPECT_EQ(Incarnation(0), 2u);
+}
+
+TEST_F(WorldLife, OnTheOnlyNodeALostServerIsReplacedThere) {
+  cluster_.LoseNode("n2", false);
+  cluster_.StartControl(0);
+  Create(Spec());
+  ASSERT_TRUE(AwaitTick(100));
+  kill(cluster_.ProcessOf("w-r0-i1"), SIGSTOP);
+  ASSERT_TRUE(Await([&] { return Incarnation(0) >= 2; }));
+  ExpectEndAsUndisturbed();
+  EXPECT_EQ(Incarnation(0), 3u) << "there was no other place for the second";
+}
+
 TEST_F(WorldLife, NextLeaderTakesOverWhatRuns) {
   cluster_.StartControl(0);
   ASSERT_TRUE(Await([&] { return cluster_.Leader() == 0; }));

@@ -53,6 +53,16 @@ Json Affinity(const PodTemplate& pods, RegionId region) {
   return affinity;
 }
 
+// By the nodes' names, as their labels may say something else; a term takes only one name per requirement.
+Json Elsewhere(const std::vector<std::string>& avoid) {
+  Json fields = Json::array();
+  for (const std::string& node : avoid) {
+    fields.push_back({{"key", "metadata.name"}, {"operator", "NotIn"}, {"values", Json::array({node})}});
+  }
+  return {{"requiredDuringSchedulingIgnoredDuringExecution",
+           {{"nodeSelectorTerms", Json::array({{{"matchFields", fields}}})}}}};
+}
+
 // The weights above are held against each other only; this one counts against how full machines are, too.
 Json Spread(const PodTemplate& pods) {
   return Json::array({{{"maxSkew", 1},
@@ -128,13 +138,19 @@ std::string Words(const Json& object) {
   return absl::StrCat(reason, reason.empty() || message.empty() ? "" : ": ", message);
 }
 
+// What the scheduler says of a Pod that it finds no node for; null when it has not said so.
+const Json* Unschedulable(const Json& pod) {
+  const Json* const conditions = Find(pod, {"status", "conditions"});
+  if (conditions == nullptr || !conditions->is_array()) return nullptr;
+  for (const Json& condition : *conditions) {
+    if (TextAt(condition, {"type"}) == "PodScheduled" && TextAt(condition, {"status"}) == "False") return &condition;
+  }
+  return nullptr;
+}
+
 std::string WhyNotStarted(const Json& pod) {
-  if (const Json* const conditions = Find(pod, {"status", "conditions"}); conditions && conditions->is_array()) {
-    for (const Json& condition : *conditions) {
-      if (TextAt(condition, {"type"}) == "PodScheduled" && TextAt(condition, {"status"}) == "False") {
-        return absl::StrCat("cannot be scheduled: ", TextAt(condition, {"message"}));
-      }
-    }
+  if (const Json* const condition = Unschedulable(pod); condition != nullptr) {
+    return absl::StrCat("cannot be scheduled: ", TextAt(*condition, {"message"}));
   }
   const Json* const status = ContainerStatus(pod);
   const Json* const waiting = status == nullptr ? nullptr : Find(*status, {"state", "waiting"});
@@ -161,7 +177,7 @@ std::string PodName(const std::string& world, RegionId region, uint64_t incarnat
 
 std::string ClaimName(const std::string& world, RegionId region) { return absl::StrCat(world, "-region-", region); }
 
-Json PodManifest(const PodTemplate& pods, const ServerStart& start) {
+Json PodManifest(const PodTemplate& pods, const ServerStart& start, const std::vector<std::string>& avoid) {
   const Json volumes = Json::array({DataVolume(pods, start.region), {{"name", "tmp"}, {"emptyDir", Json::object()}}});
   Json spec = {{"restartPolicy", "Never"},
                {"automountServiceAccountToken", false},
@@ -177,6 +193,7 @@ Json PodManifest(const PodTemplate& pods, const ServerStart& start) {
                {"topologySpreadConstraints", Spread(pods)},
                {"volumes", Appended(volumes, pods.volumes)},
                {"containers", Json::array({Container(pods, start)})}};
+  if (!avoid.empty()) spec["affinity"]["nodeAffinity"] = Elsewhere(avoid);
   if (!pods.service_account.empty()) spec["serviceAccountName"] = pods.service_account;
   if (!pods.node_selector.is_null()) spec["nodeSelector"] = pods.node_selector;
   if (!pods.tolerations.is_null()) spec["tolerations"] = pods.tolerations;
@@ -224,7 +241,10 @@ std::optional<PodView> ReadPod(const Json& pod) {
     }
   }
   view.node = TextAt(pod, {"spec", "nodeName"});
+  view.avoids = Find(pod, {"spec", "affinity", "nodeAffinity"}) != nullptr;
+  view.unschedulable = Unschedulable(pod) != nullptr;
   const Json* const status = ContainerStatus(pod);
+  view.taken = status != nullptr || !TextAt(pod, {"status", "startTime"}).empty();
   view.started = status != nullptr &&
                  (Find(*status, {"state", "running"}) != nullptr || Find(*status, {"state", "terminated"}) != nullptr);
   if (!view.started) view.waits = WhyNotStarted(pod);

@@ -41,7 +41,8 @@ std::string ClaimName(const std::string& world, RegionId region);
 
 // One Pod per server, ended for good when the server ends. Where there is the choice: on a machine that has fewer of
 // the world's Pods than others, and of those in the zone of its region's neighbours.
-Json PodManifest(const PodTemplate& pods, const ServerStart& start);
+// It never runs on the nodes of `avoid`, which are named as in spec.nodeName.
+Json PodManifest(const PodTemplate& pods, const ServerStart& start, const std::vector<std::string>& avoid = {});
 // Of the region's storage, which goes with the World; nothing when it needs none.
 std::optional<Json> ClaimManifest(const PodTemplate& pods, RegionId region);
 
@@ -50,6 +51,9 @@ struct PodView {
   ServerStart start;             // `listen`: the Pod's address, empty until it has one
   std::string name, uid, owner;  // owner: uid of the World
   std::string node;              // empty: not scheduled
+  bool avoids = false;           // nodes, as PodManifest says
+  bool unschedulable = false;    // so far
+  bool taken = false;            // its node has said something about it
   bool started = false;          // its server runs, or has
   bool leaving = false;          // deleted, but still there
   int leave_seconds = 0;         // that it has from the deletion on

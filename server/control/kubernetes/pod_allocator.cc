@@ -6,6 +6,7 @@
 #include <absl/strings/ascii.h>
 #include <absl/strings/str_cat.h>
 #include <absl/strings/str_format.h>
+#include <absl/time/time.h>
 
 #include "server/control/kubernetes/api_status.h"
 
@@ -18,6 +19,7 @@ using std::chrono::seconds;
 constexpr milliseconds kLookEvery{200};  // for what comes with time; what happens wakes us
 constexpr seconds kUnseen{5};            // until a Pod that the watch does not show is asked for
 constexpr int kEndGraceSeconds = 1;      // not 0: that would only forget the Pod, whether its server runs or not
+constexpr int kForget = 0;               // for Pods that have no server
 constexpr int kTailLines = 20;
 
 CallOptions Once(const std::stop_token& stop, milliseconds timeout = milliseconds(5000)) {
@@ -28,6 +30,14 @@ CallOptions Once(const std::stop_token& stop, milliseconds timeout = millisecond
 bool Passes(const absl::Status& s) {
   return absl::IsUnavailable(s) || absl::IsAborted(s) || absl::IsUnauthenticated(s) || absl::IsFailedPrecondition(s) ||
          absl::IsCancelled(s);
+}
+
+// For how long something holds, which has held since `*since`, if it did.
+std::chrono::steady_clock::duration HeldFor(bool holds, std::chrono::steady_clock::time_point now,
+                                            std::chrono::steady_clock::time_point* since) {
+  if (!holds) *since = {};
+  if (holds && *since == std::chrono::steady_clock::time_point()) *since = now;
+  return holds ? now - *since : std::chrono::steady_clock::duration::zero();
 }
 
 }  // namespace
@@ -120,6 +130,7 @@ void PodAllocator::End(RegionId region, uint64_t incarnation) {
     const std::lock_guard lock(mutex_);
     const auto found = servers_.find({region, incarnation});
     if (found == servers_.end()) return;
+    if (found->second.stage == Server::Stage::kMade) Avoid(found->second.node, Clock::now());
     Tell(&found->second, false, "killed: its Pod is deleted");
     found->second.remove = true;
   }
@@ -144,7 +155,7 @@ void PodAllocator::Kill() {
     if (list.ok()) {
       for (const Json& pod : *list) {
         const PodView view = *ReadPod(pod);
-        if (!view.leaving && !Delete(view.name, view.uid, {}).ok()) left = true;
+        if (!view.leaving && !Delete(view.name, view.uid, kEndGraceSeconds, {}).ok()) left = true;
         if (!EndOf(pod)) left = true;
       }
     }
@@ -207,6 +218,52 @@ uint64_t PodAllocator::NewestOf(RegionId region) const {
   return after == servers_.begin() || std::prev(after)->first.first != region ? 0 : std::prev(after)->first.second;
 }
 
+void PodAllocator::Avoid(const std::string& node, Clock::time_point now) {
+  if (!node.empty()) avoided_[node] = now + options_.avoid_for;
+}
+
+bool PodAllocator::GoesAnywhere(RegionId region, Clock::time_point now) const {
+  const auto found = anywhere_.find(region);
+  return found != anywhere_.end() && now < found->second;
+}
+
+std::vector<std::string> PodAllocator::Avoided(RegionId region, Clock::time_point now) const {
+  std::vector<std::string> out;
+  for (const auto& [node, until] : avoided_) {
+    if (now < until && !GoesAnywhere(region, now)) out.push_back(node);
+  }
+  return out;
+}
+
+void PodAllocator::Judge(Server* server, const PodView& view, Clock::time_point now) {
+  const auto leaving = HeldFor(view.leaving, now, &server->leaving_since);
+  const auto untaken = HeldFor(!view.node.empty() && !view.taken, now, &server->untaken_since);
+  const auto unschedulable = HeldFor(view.unschedulable && view.node.empty(), now, &server->unschedulable_since);
+  if (leaving > seconds(view.leave_seconds) + options_.leave_margin) {
+    Tell(server, false, absl::StrCat("node lost: ", view.node, " does not say that the deleted Pod has ended"));
+    return Avoid(view.node, now);
+  }
+  if (view.started) return;
+  const RegionId region = view.start.region;
+  // Where there is no other place, the node is waited for: the servers of a region that may end in a row are few.
+  if (untaken > options_.take_patience && !GoesAnywhere(region, now)) {
+    Tell(server, false,
+         absl::StrFormat("node lost: %s has not taken note of its Pod within %.1f s", view.node,
+                         absl::ToDoubleSeconds(absl::FromChrono(options_.take_patience))));
+    Avoid(view.node, now);
+    server->untaken = server->remove = true;
+  } else if (view.avoids && unschedulable > options_.avoid_patience) {
+    Tell(server, false, absl::StrCat(view.waits, "; the next one may run where one was lost"));
+    anywhere_[region] = now + options_.avoid_for;
+    server->remove = true;
+  } else if (now - server->made > options_.start_patience) {
+    Tell(server, false,
+         view.waits.empty() ? absl::StrFormat("has not started within %d s", options_.start_patience / seconds(1))
+                            : view.waits);
+    server->remove = true;
+  }
+}
+
 void PodAllocator::Run(const std::stop_token& stop) {
   while (!stop.stop_requested()) {
     Look(stop);
@@ -248,6 +305,7 @@ void PodAllocator::LookAt(const Json& pod, bool gone, const std::stop_token& sto
     if (server.stage == Stage::kWanted || server.uid != view->uid) return;
     server.seen = true;
     server.started = view->started;
+    server.node = view->node;
     if (gone) {
       Tell(&server, end && end->clean, end ? end->how : "deleted");
       server.stage = Stage::kGone;
@@ -262,18 +320,7 @@ void PodAllocator::LookAt(const Json& pod, bool gone, const std::stop_token& sto
       return;
     }
     if (server.stage == Stage::kGone) return;
-    if (view->leaving && server.leaving_since == Clock::time_point()) server.leaving_since = now;
-    if (!end) {
-      if (view->leaving && now - server.leaving_since > seconds(view->leave_seconds) + options_.leave_margin) {
-        Tell(&server, false, absl::StrCat("node lost: ", view->node, " does not say that the deleted Pod has ended"));
-      } else if (!view->started && now - server.made > options_.start_patience) {
-        Tell(&server, false,
-             view->waits.empty() ? absl::StrFormat("has not started within %d s", options_.start_patience / seconds(1))
-                                 : view->waits);
-        server.remove = true;
-      }
-      return;
-    }
+    if (!end) return Judge(&server, *view, now);
   }
   // The log is asked for only once, whatever comes of it.
   std::string tail;
@@ -310,15 +357,17 @@ void PodAllocator::Work(const std::stop_token& stop) {
 void PodAllocator::Make(const Key& key, const std::stop_token& stop) {
   PodTemplate pods;
   ServerStart start;
+  std::vector<std::string> avoid;
   {
     const std::lock_guard lock(mutex_);
     const auto found = servers_.find(key);
     if (found == servers_.end() || found->second.stage != Server::Stage::kWanted) return;
     pods = template_;
     start = found->second.start;
+    avoid = Avoided(start.region, Clock::now());
   }
   const absl::Status claimed = MakeClaim(pods, start.region, stop);
-  const absl::StatusOr<std::string> made = claimed.ok() ? MakePod(pods, start, stop) : claimed;
+  const absl::StatusOr<std::string> made = claimed.ok() ? MakePod(pods, start, avoid, stop) : claimed;
 
   const std::lock_guard lock(mutex_);
   const auto found = servers_.find(key);
@@ -358,8 +407,8 @@ absl::Status PodAllocator::MakeClaim(const PodTemplate& pods, RegionId region, c
 }
 
 absl::StatusOr<std::string> PodAllocator::MakePod(const PodTemplate& pods, const ServerStart& start,
-                                                  const std::stop_token& stop) {
-  const absl::StatusOr<Json> made = client_->Create(pods_, PodManifest(pods, start), Once(stop));
+                                                  const std::vector<std::string>& avoid, const std::stop_token& stop) {
+  const absl::StatusOr<Json> made = client_->Create(pods_, PodManifest(pods, start, avoid), Once(stop));
   if (made.ok()) return TextAt(*made, {"metadata", "uid"});
   if (!absl::IsAlreadyExists(made.status())) return made.status();
   const std::string name = NameOf({start.region, start.incarnation});
@@ -370,7 +419,7 @@ absl::StatusOr<std::string> PodAllocator::MakePod(const PodTemplate& pods, const
   if (view && view->owner == uid_ && view->start.token == start.token) return view->uid;  // ours, the reply was lost
   if (view && view->owner == uid_) return absl::AlreadyExistsError(absl::StrCat(name, " is of another control plane"));
   if (view && !view->owner.empty()) {  // of a World of the same name that was deleted
-    if (absl::Status s = Delete(name, view->uid, stop); !s.ok()) return s;
+    if (absl::Status s = Delete(name, view->uid, kEndGraceSeconds, stop); !s.ok()) return s;
     return absl::UnavailableError(absl::StrCat(name, " of an earlier world of this name is being deleted"));
   }
   return absl::AlreadyExistsError(absl::StrCat("there is a Pod ", name, " that is not of this world"));
@@ -378,13 +427,15 @@ absl::StatusOr<std::string> PodAllocator::MakePod(const PodTemplate& pods, const
 
 void PodAllocator::Remove(const Key& key, const std::stop_token& stop) {
   std::string uid;
+  int grace_seconds = kEndGraceSeconds;
   {
     const std::lock_guard lock(mutex_);
     const auto found = servers_.find(key);
     if (found == servers_.end()) return;
     uid = found->second.uid;
+    if (found->second.untaken) grace_seconds = kForget;
   }
-  const absl::Status status = Delete(NameOf(key), uid, stop);
+  const absl::Status status = Delete(NameOf(key), uid, grace_seconds, stop);
   const std::lock_guard lock(mutex_);
   const auto found = servers_.find(key);
   if (found == servers_.end()) return;
@@ -407,9 +458,10 @@ void PodAllocator::Check(const Key& key, const std::stop_token& stop) {
   found->second.stage = Server::Stage::kGone;
 }
 
-absl::Status PodAllocator::Delete(const std::string& name, const std::string& uid, const std::stop_token& stop) {
+absl::Status PodAllocator::Delete(const std::string& name, const std::string& uid, int grace_seconds,
+                                  const std::stop_token& stop) {
   const absl::Status status =
-      client_->Delete(pods_, name, {.uid = uid, .grace_period_seconds = kEndGraceSeconds}, Once(stop));
+      client_->Delete(pods_, name, {.uid = uid, .grace_period_seconds = grace_seconds}, Once(stop));
   // Aborted: the name has a new owner.
   return absl::IsNotFound(status) || (absl::IsAborted(status) && !uid.empty()) ? absl::OkStatus() : status;
 }
