@@ -169,12 +169,12 @@ pid_t FakeCluster::Spawn(const std::vector<std::string>& words, const std::vecto
   return pid;
 }
 
-void FakeCluster::StartControl(int index, const std::vector<std::string>& flags) {
+void FakeCluster::StartControl(int index, const std::vector<std::string>& flags, const std::string& image) {
   const std::string name = absl::StrCat("control-", index), ip = Address();
   const std::string path = absl::StrCat(kPods, "/", name);
   api_.Remove(path);
   api_.Put(path, {{"metadata", {{"labels", {{"app.kubernetes.io/name", "aureole-control"}}}}},
-                  {"spec", {{"containers", Json::array({{{"name", "control"}, {"image", "aureole"}}})}}},
+                  {"spec", {{"containers", Json::array({{{"name", "control"}, {"image", image}}})}}},
                   {"status", {{"podIP", ip}}}});
   const std::lock_guard lock(mutex_);
   std::vector<std::string> words = {AUREOLE_CONTROL,   "kubernetes", "--listen",  absl::StrCat(ip, ":", kControlPort),

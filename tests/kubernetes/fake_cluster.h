@@ -29,8 +29,9 @@ class FakeCluster {
   // Checkpoints, for World's storage.hostPath: the same on all nodes.
   std::string disk() const { return directory_ / "disk"; }
 
-  // A control plane, `index` 0, 1, ...; again after it has ended. `flags`: further ones of its command line.
-  void StartControl(int index, const std::vector<std::string>& flags = {});
+  // A control plane, `index` 0, 1, ...; again after it has ended. `flags`: further ones of its command line; `image`:
+  // what its Pod says.
+  void StartControl(int index, const std::vector<std::string>& flags = {}, const std::string& image = "aureole");
   void SignalControl(int index, int signal);
   bool ControlRuns(int index);
   int Leader();  // whose Pod has the label; -1: none

@@ -255,6 +255,25 @@ TEST_F(WorldLife, ServerThatDiesWithTheLeaderIsReplacedByTheNext) {
   EXPECT_EQ(Incarnation(0), 1u);
 }
 
+TEST_F(WorldLife, KeepsTheImageThatItBeganWithWhenTheControlPlaneIsUpgraded) {
+  const auto image = [this](const char* pod) {
+    const auto found = cluster_.api().At(absl::StrCat(kPods, pod));
+    return found ? TextAt((*found)["spec"]["containers"][0], {"image"}) : "no such Pod";
+  };
+  seconds_ = 16;  // so that a slow machine gets there before the end
+  cluster_.StartControl(0, {}, "aureole:1");
+  Create(Spec());
+  ASSERT_TRUE(AwaitTick(20));
+  EXPECT_EQ(image("w-r1-i1"), "aureole:1");
+  cluster_.SignalControl(0, SIGKILL);
+  cluster_.StartControl(1, {}, "aureole:2");
+  ASSERT_TRUE(Await([&] { return IntegerAt(Status(), {"controlEpoch"}).value_or(0) == 2; }));
+  kill(cluster_.ProcessOf("w-r1-i1"), SIGKILL);
+  ASSERT_TRUE(Await([&] { return Incarnation(1) == 2; }));
+  EXPECT_EQ(image("w-r1-i2"), "aureole:1") << "region 0 runs it still";
+  ExpectEndAsUndisturbed();
+}
+
 TEST_F(WorldLife, GoesOnWhileTheApiServerIsAway) {
   cluster_.StartControl(0);
   Create(Spec());
@@ -345,7 +364,7 @@ TEST_F(WorldLife, ChangeThatCannotBeIsSaidAndTheRunGoesOn) {
   ASSERT_TRUE(Await([&] { return Incarnation(0) == 2; }));
   const auto next = cluster_.api().At(absl::StrCat(kPods, "w-r0-i2"));
   ASSERT_TRUE(next);
-  EXPECT_EQ((*next)["spec"]["containers"][0]["image"], "newer");
+  EXPECT_EQ((*next)["spec"]["containers"][0]["image"], "newer") << "the operator's word";
   // The next control plane knows what has begun, too.
   cluster_.SignalControl(0, SIGKILL);
   cluster_.StartControl(1);

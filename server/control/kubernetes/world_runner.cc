@@ -174,8 +174,10 @@ WorldRunner::Next WorldRunner::Try(const Json& object) {
   }
   // Of a run that an earlier control plane has begun.
   const Json* const accepted = Find(status, {kAccepted, "fixed"});
+  defaults_ = context_->defaults;
+  Pin(TextAt(status, {kAccepted, "image"}), TextAt(status, {kAccepted, "imagePullPolicy"}));
   const absl::StatusOr<WorldResource> world =
-      ReadWorld(accepted != nullptr ? WithFixed(object, *accepted) : object, *file, context_->defaults);
+      ReadWorld(accepted != nullptr ? WithFixed(object, *accepted) : object, *file, defaults_);
   if (!world.ok()) {
     const Next next = Refuse(generation, accepted != nullptr ? "Failed" : "Pending", "Refused",
                              std::string(world.status().message()));
@@ -189,7 +191,14 @@ WorldRunner::Next WorldRunner::Try(const Json& object) {
     return Refuse(generation, "Failed", "CannotChange",
                   "spec.world: has changed while the world ran; change it back, or delete the World and make it anew");
   }
+  if (accepted == nullptr) Pin(world->pods.image, world->pods.pull_policy);
   return RunOnce(*world);
+}
+
+void WorldRunner::Pin(const std::string& image, const std::string& pull_policy) {
+  if (image.empty()) return;
+  defaults_.image = image;
+  defaults_.pull_policy = pull_policy;
 }
 
 PodAllocator::Options WorldRunner::PodOptions(const PodTemplate& pods) const {
@@ -219,7 +228,8 @@ WorldRunner::Next WorldRunner::RunOnce(WorldResource world) {
 
   WorldStatus begun;
   begun.generation = world.generation;
-  begun.fields = {{kAccepted, {{"fixed", world.fixed}, {"worldHash", world.world_hash}}}};
+  begun.fields = {{kAccepted, {{"fixed", world.fixed}, {"worldHash", world.world_hash}, {"image", defaults_.image}}}};
+  if (!defaults_.pull_policy.empty()) begun.fields[kAccepted]["imagePullPolicy"] = defaults_.pull_policy;
   store_.Publish(begun);
 
   std::string not_applied;
@@ -280,7 +290,7 @@ std::string WorldRunner::Change(const Json& object, WorldResource* world) {
   world->generation = GenerationOf(object);
   const absl::StatusOr<std::optional<std::string>> file = ReadSource(object);
   if (!file.ok()) return std::string(file.status().message());
-  const absl::StatusOr<WorldResource> wanted = ReadWorld(object, *file, context_->defaults);
+  const absl::StatusOr<WorldResource> wanted = ReadWorld(object, *file, defaults_);
   if (!wanted.ok()) return std::string(wanted.status().message());
   const Storage storage = world->pods.storage;
   world->pods = wanted->pods;

@@ -72,6 +72,9 @@ class WorldRunner {
   // The text that the World's worldFrom points to; nothing when it is not there, or there is no worldFrom.
   absl::StatusOr<std::optional<std::string>> ReadSource(const Json& object);
   Next Refuse(int64_t generation, const std::string& phase, const std::string& reason, const std::string& message);
+  // All servers of a world have to run one binary: where the World names none it is the one that the world began with,
+  // and not that of a control plane which was upgraded since. Nothing when `image` is empty.
+  void Pin(const std::string& image, const std::string& pull_policy);
   // Takes over what may change of a world that runs; else says what may not.
   std::string Change(const Json& object, WorldResource* world);
   void Tell(bool warning, const std::string& reason, const std::string& message);
@@ -81,6 +84,7 @@ class WorldRunner {
   const RunnerContext* const context_;
   const std::string space_, name_, uid_;
   StatusStore store_;
+  PodDefaults defaults_;  // with the image that the world began with
   std::string told_phase_;
   std::atomic<bool> stopping_ = false, done_ = false;
 
