@@ -282,7 +282,10 @@ Json FakeApiServer::Store(const Place& place, Json object, const char* type) {
 
 std::optional<Fault> FakeApiServer::TakeFault(const httplib::Request& request) {
   for (auto it = faults_.begin(); it != faults_.end(); ++it) {
-    if (it->method != request.method || !absl::StrContains(request.target, it->target)) continue;
+    if (it->method != request.method || !absl::StrContains(request.target, it->target) ||
+        !absl::StrContains(request.body, it->body)) {
+      continue;
+    }
     Fault fault = *it;
     if (--it->times == 0) faults_.erase(it);
     return fault;
@@ -307,7 +310,7 @@ void FakeApiServer::Handle(const httplib::Request& request, httplib::Response& r
   if (fault && fault->kind == Kind::kStatus) {
     if (fault->retry_after >= 0) response.set_header("Retry-After", std::to_string(fault->retry_after));
     return Refuse(response, fault->status, fault->reason.empty() ? ReasonOfCode(fault->status) : fault->reason,
-                  "injected");
+                  fault->message);
   }
   if (fault && fault->kind == Kind::kSlow) changed_.wait_for(lock, fault->delay, [this] { return stopping_; });
   if (fault && fault->kind == Kind::kHang) {

@@ -23,7 +23,7 @@
 
 namespace aureole::kubernetes {
 
-// What goes wrong with the next `times` requests of this method and with this text in the target.
+// What goes wrong with the next `times` requests of this method and with these texts in the target and the body.
 struct Fault {
   enum class Kind : uint8_t {
     kStatus,       // refused with `status`
@@ -44,6 +44,7 @@ struct Fault {
   std::string reason = "";
   int retry_after = -1;  // seconds; -1: not said
   std::chrono::milliseconds delay{0};
+  std::string body = "", message = "injected";
 };
 
 class FakeApiServer {

@@ -7,6 +7,8 @@
 
 #include <atomic>
 #include <memory>
+#include <mutex>
+#include <thread>
 
 #include <absl/strings/match.h>
 
@@ -54,14 +56,35 @@ class StatusStoreTest : public testing::Test {
     options.interval = interval;
     options.first_pause = milliseconds(5);
     options.longest_pause = milliseconds(50);
+    options.first_refusal = milliseconds(200);
+    options.longest_refusal = milliseconds(400);
+    options.refused = [this](const std::string& why) {
+      const std::lock_guard lock(mutex_);
+      refusals_.push_back(why);
+    };
     store_ = std::make_unique<StatusStore>(&client_, options);
   }
   Json There() { return (*server_.At(kWorld))["status"]; }
+  std::vector<std::string> Refusals() {
+    const std::lock_guard lock(mutex_);
+    return refusals_;
+  }
+  // What the schema does with a status that has this text.
+  static Fault Refusal(const std::string& text, int times) {
+    return {.kind = Kind::kStatus,
+            .method = "PATCH",
+            .times = times,
+            .status = 422,
+            .body = text,
+            .message = "World \"w\" is invalid: status.tick: Invalid value: \"string\""};
+  }
 
   FakeApiServer server_;
   ApiClient client_{server_.Access()};
   std::string uid_;
   std::atomic<bool> leads_ = true;
+  std::mutex mutex_;
+  std::vector<std::string> refusals_;
   std::unique_ptr<StatusStore> store_;
 };
 
@@ -175,6 +198,49 @@ TEST_F(StatusStoreTest, SaveThatWaitsEndsWithClose) {
   });
   EXPECT_TRUE(absl::IsCancelled(store_->Save(Record(1))));
   closer.join();
+}
+
+TEST_F(StatusStoreTest, RefusedFieldsAreToldOfAndDoNotHoldUpTheRecord) {
+  server_.Inject(Refusal("\"tick\":7", -1));
+  store_->Publish(Status(7));
+  ASSERT_TRUE(store_->Save(Record(1)).ok());
+  ASSERT_TRUE(store_->Save(Record(2)).ok());
+  EXPECT_EQ(There()["record"]["regions"][0]["incarnation"], "2");
+  EXPECT_EQ(There()["controlEpoch"], 1);
+  EXPECT_FALSE(There().contains("tick"));
+  ASSERT_EQ(Refusals().size(), 1u) << "it is the same one";
+  EXPECT_TRUE(absl::StrContains(Refusals()[0], "422 Invalid: World \"w\" is invalid: status.tick: Invalid value"));
+  EXPECT_GE(client_.stats().refused, 1);
+  store_->Publish(Status(8));
+  EXPECT_TRUE(Await([&] { return IntegerAt(There(), {"tick"}) == 8; })) << "those that are right are written";
+}
+
+TEST_F(StatusStoreTest, RefusedStatusIsTriedAgainMoreAndMoreSeldom) {
+  server_.Inject(Refusal("", -1));
+  const auto end = std::chrono::steady_clock::now() + seconds(2);
+  for (int64_t tick = 1; std::chrono::steady_clock::now() < end; ++tick) {
+    store_->Publish(Status(tick));
+    std::this_thread::sleep_for(milliseconds(2));
+  }
+  EXPECT_GE(server_.Count("PATCH"), 4) << "it may be right by now";
+  EXPECT_LE(server_.Count("PATCH"), 16) << "with each a try with the epoch alone";
+  EXPECT_EQ(Refusals().size(), 1u);
+}
+
+TEST_F(StatusStoreTest, RecordThatIsRefusedIsAnErrorAndNotAWait) {
+  server_.Inject(Refusal("record", -1));
+  const absl::Status s = store_->Save(Record(1));
+  EXPECT_TRUE(absl::IsInvalidArgument(s)) << s;
+  EXPECT_TRUE(absl::StrContains(s.message(), "status.tick: Invalid value"));
+  EXPECT_EQ(Refusals().size(), 1u);
+  store_->Publish(Status(7));
+  EXPECT_TRUE(Await([&] { return IntegerAt(There(), {"tick"}) == 7; }));
+}
+
+TEST_F(StatusStoreTest, ForbiddenStatusIsToldOfAndWaitedFor) {
+  server_.Inject({.kind = Kind::kStatus, .method = "PATCH", .times = 3, .status = 403});
+  ASSERT_TRUE(store_->Save(Record(1)).ok());
+  EXPECT_EQ(Refusals().size(), 1u);
 }
 
 struct FaultCase {

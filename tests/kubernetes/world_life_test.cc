@@ -5,6 +5,7 @@
 
 #include <signal.h>
 
+#include <algorithm>
 #include <filesystem>
 #include <fstream>
 #include <iterator>
@@ -326,6 +327,25 @@ TEST_F(WorldLife, RunThatFailedIsToldAndTriedAgain) {
   EXPECT_TRUE(absl::StrContains(Condition("Ready", "message"), "its Pod cannot be made: POST"))
       << Condition("Ready", "message");
   cluster_.api().Merge(absl::StrCat(kWorlds, "w"), {{"spec", {{"image", "another"}}}});  // does not wait for its time
+  ExpectEndAsUndisturbed();
+}
+
+TEST_F(WorldLife, RefusedStatusIsToldOfAndTheWorldGoesOn) {
+  cluster_.api().Inject({.method = "PATCH",
+                         .target = "/worlds/w/status",
+                         .times = 3,
+                         .status = 422,
+                         .body = "regionsReady",
+                         .message = "World \"w\" is invalid: status.regionsReady: Invalid value"});
+  cluster_.StartControl(0);
+  Create(Spec());
+  ASSERT_TRUE(Await([&] { return HasEvent("StatusRefused"); }));
+  const std::vector<Json> events = cluster_.api().All("/api/v1/namespaces/test/events");
+  EXPECT_TRUE(std::any_of(events.begin(), events.end(), [](const Json& event) {
+    return absl::StrContains(TextAt(event, {"message"}), "status.regionsReady: Invalid value");
+  }));
+  EXPECT_TRUE(absl::StrContains(cluster_.Logs(), "[control] world w: its status is refused: PATCH"));
+  ASSERT_TRUE(Await([&] { return cluster_.processes() == 2; })) << "the record was written";
   ExpectEndAsUndisturbed();
 }
 

@@ -63,7 +63,7 @@ ApiClient::ApiClient(ClusterAccess access) : access_(std::move(access)), token_(
 
 ApiClient::~ApiClient() = default;
 
-ApiStats ApiClient::stats() const { return {requests_, repeated_, tokens_renewed_}; }
+ApiStats ApiClient::stats() const { return {requests_, repeated_, tokens_renewed_, refused_}; }
 
 absl::StatusOr<Json> ApiClient::Get(const Resource& resource, const std::string& name, const CallOptions& options) {
   const absl::StatusOr<std::string> path = resource.ObjectPath(name);
@@ -180,6 +180,7 @@ absl::StatusOr<Json> ApiClient::Call(const Request& request, const CallOptions& 
     const auto left = std::chrono::duration_cast<milliseconds>(deadline - Clock::now());
     bool acted_on = false;
     absl::StatusOr<Json> reply = CallOnce(request, std::min(left, options.attempt_timeout), options.stop, &acted_on);
+    if (absl::IsInvalidArgument(reply.status())) ++refused_;
     if (!absl::IsUnavailable(reply.status()) || attempt >= options.attempts || (acted_on && !request.repeatable)) {
       return reply;
     }

@@ -80,6 +80,7 @@ struct ApiStats {
   int64_t requests = 0;        // sent or tried
   int64_t repeated = 0;        // of these, because the one before had failed
   int64_t tokens_renewed = 0;  // after a 401
+  int64_t refused = 0;         // as not valid: 400, 413, 415, 422
 };
 
 class ApiClient {
@@ -142,7 +143,7 @@ class ApiClient {
   BearerToken token_;
   std::mutex mutex_;
   std::vector<std::unique_ptr<HttpConnection>> idle_;
-  std::atomic<int64_t> requests_{0}, repeated_{0}, tokens_renewed_{0};
+  std::atomic<int64_t> requests_{0}, repeated_{0}, tokens_renewed_{0}, refused_{0};
 };
 
 }  // namespace aureole::kubernetes

@@ -33,6 +33,8 @@ struct ControlMetrics::Impl {
   prometheus::Counter& requests = Counter("aureole_control_api_requests_total", "Requests to the API server.");
   prometheus::Counter& repeated =
       Counter("aureole_control_api_repeated_total", "Of these, because the one before had failed.");
+  prometheus::Counter& refused =
+      Counter("aureole_control_api_refused_total", "Of these, refused as not valid, such as a status by the schema.");
 };
 
 ControlMetrics::ControlMetrics(std::unique_ptr<Impl> impl) : impl_(std::move(impl)) {}
@@ -55,6 +57,7 @@ void ControlMetrics::Update(int64_t epoch, size_t worlds, const ApiStats& api) {
   impl_->worlds.Set(static_cast<double>(worlds));
   Impl::Raise(&impl_->requests, api.requests);
   Impl::Raise(&impl_->repeated, api.repeated);
+  Impl::Raise(&impl_->refused, api.refused);
 }
 
 }  // namespace aureole::kubernetes

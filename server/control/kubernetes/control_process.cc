@@ -103,6 +103,7 @@ class ControlProcess {
     context.epoch = epoch;
     context.leads = [&elector, epoch] { return elector.Epoch() == epoch; };
     context.leave = &leave_;
+    context.log = Log;
     absl::Status told;
     while (true) {
       const absl::Status s = Know(&context);

@@ -100,9 +100,11 @@ absl::Status StatusStore::SaveText(Json record) {
   std::unique_lock lock(mutex_);
   if (!lost_.ok()) return lost_;
   record_ = std::move(record);
+  record_refused_ = absl::OkStatus();
   changed_.notify_all();
   changed_.wait(lock, [this] { return !record_ || !lost_.ok() || closed_; });
   if (!lost_.ok()) return lost_;
+  if (!record_refused_.ok()) return record_refused_;
   return record_ ? absl::CancelledError("the record is not written: the control plane ends") : absl::OkStatus();
 }
 
@@ -137,6 +139,8 @@ bool StatusStore::Flush(milliseconds at_most) {
 
 void StatusStore::Run(const std::stop_token& stop) {
   Backoff backoff(options_.first_pause, options_.longest_pause);
+  Backoff refusals(options_.first_refusal, options_.longest_refusal);
+  std::string told;
   Clock::time_point next;  // for what people see
   while (!stop.stop_requested()) {
     {
@@ -146,16 +150,34 @@ void StatusStore::Run(const std::stop_token& stop) {
       if (stop.stop_requested()) return;
       writing_ = true;
     }
-    absl::Status s = Write(stop);
+    absl::Status s = Write(What::kAll, stop);
     next = Clock::now() + options_.interval;
+    const bool refused = absl::IsInvalidArgument(s);
+    if (refused || absl::IsPermissionDenied(s)) {
+      const std::string why(s.message());
+      if (told != why) options_.refused(why);
+      told = why;
+    } else if (s.ok()) {
+      told.clear();
+      refusals.Reset();
+    }
+    // Nobody asks for the same again and again, but the run does not wait for what people see.
+    if (refused) {
+      next = Clock::now() + refusals.Next();
+      s = Write(What::kRecord, stop);
+    }
     {
       const std::lock_guard lock(mutex_);
       writing_ = false;
+      if (absl::IsInvalidArgument(s)) {
+        record_refused_ = s;
+        record_.reset();
+      }
       if (absl::IsAborted(s)) lost_ = s;
       if (!lost_.ok()) dirty_ = false;
     }
     changed_.notify_all();
-    if (s.ok() || absl::IsAborted(s)) {
+    if (s.ok() || absl::IsAborted(s) || absl::IsInvalidArgument(s)) {
       backoff.Reset();
       continue;
     }
@@ -164,11 +186,14 @@ void StatusStore::Run(const std::stop_token& stop) {
   }
 }
 
-Json StatusStore::Missing(const std::string& now) const {
-  Json wanted = wanted_.fields;
+Json StatusStore::Missing(What what, const std::string& now) const {
+  Json wanted = Json::object();
+  if (what == What::kAll) {
+    wanted = wanted_.fields;
+    if (wanted_.generation > 0) wanted["observedGeneration"] = wanted_.generation;
+    wanted[kConditions] = ConditionList(there_.value(kConditions, Json()), wanted_, now);
+  }
   wanted[kEpoch] = options_.epoch;
-  if (wanted_.generation > 0) wanted["observedGeneration"] = wanted_.generation;
-  wanted[kConditions] = ConditionList(there_.value(kConditions, Json()), wanted_, now);
   if (record_) wanted[kRecord] = *record_;
   Json missing = Json::object();
   for (const auto& [key, value] : wanted.items()) {
@@ -179,7 +204,7 @@ Json StatusStore::Missing(const std::string& now) const {
 }
 
 // One try, and another one at once when the World has changed meanwhile.
-absl::Status StatusStore::Write(const std::stop_token& stop) {
+absl::Status StatusStore::Write(What what, const std::stop_token& stop) {
   while (true) {
     bool known = false;
     {
@@ -193,9 +218,9 @@ absl::Status StatusStore::Write(const std::stop_token& stop) {
     std::optional<Json> record;
     {
       const std::lock_guard lock(mutex_);
-      missing = Missing(Now());
+      missing = Missing(what, Now());
       record = record_;
-      dirty_ = false;
+      if (what == What::kAll) dirty_ = false;
       if (missing.empty()) {
         record_.reset();
         return absl::OkStatus();

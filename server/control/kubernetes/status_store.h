@@ -22,7 +22,9 @@
 namespace aureole::kubernetes {
 
 // Load and Save as WorldStore says, and besides: Save waits for the API server for as long as we lead; Cancelled after
-// Close. Aborted also when the World is gone, or when we lead no more.
+// Close. Aborted also when the World is gone, or when we lead no more. InvalidArgument: the record is refused, by the
+// schema or for its size. A status that is refused for its other fields is told of and tried again, more and more
+// seldom; the record goes without them.
 class StatusStore final : public WorldStore {
  public:
   struct Options {
@@ -31,6 +33,8 @@ class StatusStore final : public WorldStore {
     std::function<bool()> leads = [] { return true; };                // asked before every write; any thread
     std::chrono::milliseconds interval{1000};                         // between two writes without a record, at least
     std::chrono::milliseconds first_pause{100}, longest_pause{5000};  // after failures
+    std::chrono::milliseconds first_refusal{1000}, longest_refusal{60000};        // after refusals: pauses
+    std::function<void(const std::string&)> refused = [](const std::string&) {};  // why; on the store's thread
   };
 
   // `client` must outlive it.
@@ -58,11 +62,12 @@ class StatusStore final : public WorldStore {
   using Clock = std::chrono::steady_clock;
 
   void Run(const std::stop_token& stop);
-  absl::Status Write(const std::stop_token& stop);
+  enum class What : uint8_t { kAll, kRecord };
+  absl::Status Write(What what, const std::stop_token& stop);
   absl::Status Read(const std::stop_token& stop);
   absl::Status SaveText(Json record);
   // Holds the mutex: what is there is not yet what is wanted.
-  Json Missing(const std::string& now) const;
+  Json Missing(What what, const std::string& now) const;
 
   ApiClient* const client_;
   const Options options_;
@@ -75,7 +80,8 @@ class StatusStore final : public WorldStore {
   WorldStatus wanted_;
   std::optional<Json> record_;  // to be written; null: to be removed
   bool dirty_ = false, writing_ = false, closed_ = false;
-  absl::Status lost_;  // Aborted: nothing can be written any more
+  absl::Status lost_;            // Aborted: nothing can be written any more
+  absl::Status record_refused_;  // InvalidArgument: of the last record
   std::jthread thread_;
 };
 

@@ -24,13 +24,15 @@ constexpr char kAccepted[] = "accepted";
 
 int64_t GenerationOf(const Json& object) { return IntegerAt(object, {"metadata", "generation"}).value_or(0); }
 
-StatusStore::Options StoreOptions(const RunnerContext& context, const Json& object) {
+StatusStore::Options StoreOptions(const RunnerContext& context, const Json& object,
+                                  std::function<void(const std::string&)> refused) {
   StatusStore::Options options = context.status;
   options.space = TextAt(object, {"metadata", "namespace"});
   options.name = TextAt(object, {"metadata", "name"});
   options.uid = TextAt(object, {"metadata", "uid"});
   options.epoch = context.epoch;
   options.leads = context.leads;
+  options.refused = std::move(refused);
   return options;
 }
 
@@ -82,7 +84,7 @@ WorldRunner::WorldRunner(const RunnerContext* context, Object world)
       space_(TextAt(*world, {"metadata", "namespace"})),
       name_(TextAt(*world, {"metadata", "name"})),
       uid_(TextAt(*world, {"metadata", "uid"})),
-      store_(context->client, StoreOptions(*context, *world)),
+      store_(context->client, StoreOptions(*context, *world, [this](const std::string& why) { TellRefused(why); })),
       object_(std::move(world)),
       thread_([this] { Run(); }) {}
 
@@ -109,6 +111,11 @@ Object WorldRunner::Latest() const {
 void WorldRunner::Tell(bool warning, const std::string& reason, const std::string& message) {
   context_->events->Record(
       {{absl::StrCat(kWorldGroup, "/", kWorldVersion), kWorldKind, space_, name_, uid_}, warning, reason, message});
+}
+
+void WorldRunner::TellRefused(const std::string& why) {
+  Tell(true, "StatusRefused", why);
+  context_->log(absl::StrCat("world ", name_, ": its status is refused: ", why));
 }
 
 void WorldRunner::Run() {
@@ -277,7 +284,7 @@ WorldRunner::Next WorldRunner::RunOnce(WorldResource world) {
     return Next::kOnChange;
   }
   // Its servers go on: the status could not be written or read. Whoever has the lease tries again.
-  if (allocator.released()) return Next::kSoon;
+  if (allocator.released()) return absl::IsInvalidArgument(s) ? Next::kLater : Next::kSoon;
   WorldStatus failed = StoppedStatus(world.generation, "Failed", "RunFailed", std::string(s.message()));
   failed.fields[kAccepted] = nullptr;
   store_.Publish(failed);

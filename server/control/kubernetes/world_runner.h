@@ -35,6 +35,7 @@ struct RunnerContext {
   PodDefaults defaults;
   int64_t epoch = 1;
   std::function<bool()> leads = [] { return true; };
+  std::function<void(const std::string&)> log = [](const std::string&) {};  // any thread
   // Once it is true, runners end and the servers go on.
   const std::atomic<bool>* leave = nullptr;
   PodAllocator::Options pods = {};   // its times
@@ -78,6 +79,7 @@ class WorldRunner {
   // Takes over what may change of a world that runs; else says what may not.
   std::string Change(const Json& object, WorldResource* world);
   void Tell(bool warning, const std::string& reason, const std::string& message);
+  void TellRefused(const std::string& why);  // uses nothing that is declared after the store
   bool ends() const { return stopping_ || *context_->leave; }
   Object Latest() const;
 
