@@ -40,6 +40,7 @@ WORLD = {"apiVersion": "aureole.dev/v1alpha1", "kind": "World", "metadata": {"na
 NEEDED = [
     ("GET", WORLDS, None), ("GET", WORLDS + "?watch=1&timeoutSeconds=1", None), ("GET", WORLDS + "/access", None),
     ("PATCH", WORLDS + "/access/status", {"status": {"phase": "Pending"}}),
+    ("PATCH", WORLDS + "/access/scale", {"spec": {"replicas": 2}}),
     ("GET", CONFIG_MAPS + "/access", None),
     ("GET", collection("v1", "services") + "/aureole-control", None),
     ("POST", CLAIMS, CLAIM), ("GET", CLAIMS + "/access", None),

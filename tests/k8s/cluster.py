@@ -199,7 +199,7 @@ class Ticks:
 
 
 class World:
-    """A World of the cluster, from tests/worlds/FILE; all that it says of itself is kept."""
+    """A World of the cluster, from tests/worlds/FILE; all that it says of itself is kept. Fields that are None are left out."""
 
     def __init__(self, name, file, **spec):
         self.name = name
@@ -217,6 +217,7 @@ class World:
                      "imagePullPolicy": "Never" if IMAGE.startswith("localhost/") else "IfNotPresent",
                      "resources": {"requests": {"cpu": "50m", "memory": "64Mi"}},
                      "storage": storage, "hashEvery": HASH_EVERY, **spec}}
+        self.object["spec"] = {k: v for k, v in self.object["spec"].items() if v is not None}
         self.hashes = {}  # tick: (hash, bodies), all that were ever said
         self._last = {}
         self._watch = None

@@ -7,6 +7,11 @@ from cluster import WorldTest, get, kubectl, wait_for
 STOP_S = 10  # longest; the aim is 2
 
 
+def budget():
+    status = get("pdb", "aureole-regions")["status"]
+    return status["currentHealthy"], status["desiredHealthy"], status["disruptionsAllowed"]
+
+
 class Maintenance(WorldTest):
     def setUp(self):
         super().setUp()
@@ -48,8 +53,20 @@ class Maintenance(WorldTest):
         self.assertNotIn(node, [r["node"] for r in self.world.status()["regions"]])
 
     def test_budget_lets_only_one_region_be_evicted_at_a_time(self):
-        def budget():
-            status = get("pdb", "aureole-regions")["status"]
-            return status["currentHealthy"], status["desiredHealthy"], status["disruptionsAllowed"]
-
         wait_for(lambda: budget() == (4, 3, 1), "four regions, of which three must stay")
+
+
+class WithoutReplicas(WorldTest):
+    """A World that does not say how many regions it has."""
+
+    spec = {"replicas": None}
+
+    def test_world_without_replicas_has_a_budget_and_its_node_is_drained(self):
+        wait_for(lambda: get("world", self.world.name)["spec"].get("replicas") == 4, "the number of its layout")
+        wait_for(lambda: budget() == (4, 3, 1), "four regions, of which three must stay")
+        node = self.world.pod_of(0)["spec"]["nodeName"]
+        self.addCleanup(kubectl, "uncordon", node, space=None)
+        kubectl("drain", node, "--ignore-daemonsets", "--force", "--delete-emptydir-data", "--timeout=120s", space=None, timeout=150)
+        self.measure("drain", time.monotonic() - self.began)
+        self.world.runs()
+        self.assert_exact()

@@ -391,6 +391,22 @@ TEST_F(WorldLife, ChangeThatCannotBeIsSaidAndTheRunGoesOn) {
   ExpectEndAsUndisturbed();
 }
 
+// Budgets count by it; without it, no Pod may ever be evicted.
+TEST_F(WorldLife, WorldThatDoesNotSayHowManyRegionsItHasIsGivenThem) {
+  const auto replicas = [this] { return IntegerAt(cluster_.World("w"), {"spec", "replicas"}).value_or(0); };
+  cluster_.api().Inject({.method = "PATCH", .target = "/worlds/w/scale", .status = 403});
+  seconds_ = 16;
+  cluster_.StartControl(0);
+  Create(Spec());
+  ASSERT_TRUE(Await([&] { return HasEvent("CannotScale"); }));
+  ASSERT_TRUE(Await([&] { return replicas() == 2; })) << "it is tried again";
+  cluster_.api().Merge(absl::StrCat(kWorlds, "w"), {{"spec", {{"replicas", 3}}}});
+  ASSERT_TRUE(Await([&] { return TextAt(Status(), {"regionsReady"}) == "3/3"; }));
+  EXPECT_EQ(replicas(), 3) << "that was the operator's word";
+  EXPECT_EQ(cluster_.api().Count("PATCH /apis/aureole.dev/v1alpha1/namespaces/test/worlds/w/scale"), 2);
+  ExpectEndAsUndisturbed();
+}
+
 TEST_F(WorldLife, ScaledWorldGetsAndLosesServersAndNoBitChanges) {
   seconds_ = 16;  // so that a slow machine gets there before the end
   cluster_.StartControl(0);
@@ -493,6 +509,8 @@ INSTANTIATE_TEST_SUITE_P(
                   {.kind = Kind::kLostReply, .method = "PATCH", .target = "/worlds/w/status", .times = 3}},
         FaultCase{"StatusSlow",
                   {.kind = Kind::kSlow, .method = "PATCH", .target = "/status", .delay = milliseconds(1500)}},
+        FaultCase{"ReplicasStatus503", {.method = "PATCH", .target = "/worlds/w/scale", .status = 503}},
+        FaultCase{"ReplicasReplyLost", {.kind = Kind::kLostReply, .method = "PATCH", .target = "/worlds/w/scale"}},
         FaultCase{"ClaimStatus500", {.method = "POST", .target = "/persistentvolumeclaims", .times = 3, .status = 500}},
         FaultCase{"ClaimReplyLost", {.kind = Kind::kLostReply, .method = "POST", .target = "/persistentvolumeclaims"}},
         FaultCase{"AdoptionStatus503",

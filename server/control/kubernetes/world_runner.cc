@@ -10,6 +10,7 @@
 #include <absl/strings/str_join.h>
 
 #include "server/control/kubernetes/backoff.h"
+#include "server/control/kubernetes/replicas_writer.h"
 #include "server/control/layout_desk.h"
 #include "server/transport/world_spec.h"
 
@@ -18,7 +19,7 @@ namespace {
 
 using std::chrono::milliseconds;
 
-constexpr milliseconds kPublishEvery{500}, kLookEvery{100};
+constexpr milliseconds kPublishEvery{500}, kLookEvery{100}, kReplicasAgain{5000};
 // Of status: what cannot change of a run that has begun and not ended. For the next control plane.
 constexpr char kAccepted[] = "accepted";
 
@@ -254,6 +255,7 @@ WorldRunner::Next WorldRunner::RunOnce(WorldResource world) {
     told_phase_ = phase;
     store_.Publish(status);
   };
+  ReplicasWriter replicas(context_->client, space_, name_, kReplicasAgain);
   const auto observe = [&](const RunStatus& now) {
     if (const Object latest = Latest(); GenerationOf(*latest) != looked_at) {
       looked_at = GenerationOf(*latest);
@@ -263,6 +265,11 @@ WorldRunner::Next WorldRunner::RunOnce(WorldResource world) {
       }
       allocator.Use(world.pods);
       if (!not_applied.empty()) Tell(true, "CannotChange", not_applied);
+    }
+    if (context_->leads() && !stopping_) {
+      if (absl::Status s = replicas.Look(*Latest(), world.replicas); !s.ok()) {
+        Tell(true, "CannotScale", absl::StrCat("spec.replicas: cannot be written: ", std::string(s.message())));
+      }
     }
     if (Clock::now() >= next_publish || now.stage != stage) {
       next_publish = Clock::now() + kPublishEvery;
