@@ -1,8 +1,9 @@
 """A World from `kubectl apply` on: its servers, what kubectl tells of it, what clients see, and that it is exact."""
 
 import json
+import time
 
-from cluster import SOURCE, World, WorldTest, aureole, get, kubectl, wait_for
+from cluster import CONTROL, SOURCE, World, WorldTest, aureole, deploy, get, kubectl, pods, wait_for
 
 READY_S = 15
 
@@ -75,6 +76,17 @@ class Start(WorldTest):
     def test_deleted_world_leaves_no_pod(self):
         kubectl("delete", "world", self.world.name, "--timeout=60s")
         wait_for(lambda: not self.world.pods(), "its pods to go")
+
+    def test_world_deleted_while_no_control_plane_runs_leaves_no_pod(self):
+        self.addCleanup(deploy)
+        self.addCleanup(kubectl, "scale", "deployment/aureole-control", "--replicas=2")
+        kubectl("scale", "deployment/aureole-control", "--replicas=0")
+        wait_for(lambda: not pods(CONTROL), "the end of the control plane")
+        began = time.monotonic()
+        kubectl("delete", "world", self.world.name, "--timeout=60s")
+        # Servers have 30 s, and need none of them; the kubelet takes its time to say so.
+        wait_for(lambda: not self.world.pods(), "its pods to go")
+        self.measure("deleted to all pods gone", time.monotonic() - began, 28)
 
 
 class Refusals(WorldTest):

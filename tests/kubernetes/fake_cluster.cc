@@ -12,6 +12,7 @@
 
 #include <algorithm>
 #include <fstream>
+#include <set>
 #include <sstream>
 
 #include <absl/strings/numbers.h>
@@ -29,6 +30,8 @@ using Clock = std::chrono::steady_clock;
 using std::chrono::milliseconds;
 
 constexpr char kPods[] = "/api/v1/namespaces/test/pods";
+constexpr char kClaims[] = "/api/v1/namespaces/test/persistentvolumeclaims";
+constexpr char kWorlds[] = "/apis/aureole.dev/v1alpha1/namespaces/test/worlds";
 constexpr int kControlPort = 7100;
 
 sockaddr_in At(const std::string& ip, int port) {
@@ -251,10 +254,30 @@ std::string FakeCluster::Logs() const {
   return out.str();
 }
 
-// Scheduler and all kubelets.
+// What belongs to a World that is not there any more is deleted: Pods have their time to end.
+void FakeCluster::CollectGarbage() {
+  std::set<std::string> worlds;
+  const std::vector<Json> pods = api_.All(kPods), claims = api_.All(kClaims);
+  for (const Json& world : api_.All(kWorlds)) worlds.insert(TextAt(world, {"metadata", "uid"}));
+  const auto orphaned = [&worlds](const Json& object) {
+    const Json* const owners = Find(object, {"metadata", "ownerReferences"});
+    return owners != nullptr && !worlds.contains(TextAt(owners->front(), {"uid"}));
+  };
+  for (const Json& claim : claims) {
+    if (orphaned(claim)) api_.Remove(absl::StrCat(kClaims, "/", TextAt(claim, {"metadata", "name"})));
+  }
+  for (const Json& pod : pods) {
+    if (!orphaned(pod) || pod["metadata"].contains("deletionTimestamp")) continue;
+    api_.Merge(absl::StrCat(kPods, "/", TextAt(pod, {"metadata", "name"})),
+               {{"metadata", {{"deletionTimestamp", "2026-01-01T00:00:00Z"}, {"deletionGracePeriodSeconds", 30}}}});
+  }
+}
+
+// Scheduler, garbage collector and all kubelets.
 void FakeCluster::Run(const std::stop_token& stop) {
   int round = 0;
   while (!stop.stop_requested()) {
+    CollectGarbage();
     for (const Json& pod : api_.All(kPods)) {
       if (TextAt(pod, {"metadata", "labels", kWorldLabel}).empty()) continue;
       const std::string path = absl::StrCat(kPods, "/", TextAt(pod, {"metadata", "name"}));

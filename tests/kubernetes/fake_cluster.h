@@ -1,6 +1,6 @@
 // A cluster for tests: the fake API server, nodes that run what a Pod says as processes of this machine, a scheduler
-// that weighs what Pods prefer, control planes, and the Service by which their leader is found. Every Pod has an
-// address of its own in 127.0.0.0/8.
+// that weighs what Pods prefer, the garbage collector, control planes, and the Service by which their leader is found.
+// Every Pod has an address of its own in 127.0.0.0/8.
 #pragma once
 
 #include <sys/types.h>
@@ -62,6 +62,7 @@ class FakeCluster {
 
   std::string Address();
   void Run(const std::stop_token& stop);
+  void CollectGarbage();
   void Schedule(const std::string& path, const Json& pod, int round);
   void Tend(const std::string& path, const Json& pod);
   void StartContainer(const std::string& path, const Json& pod, const std::string& node);

@@ -299,6 +299,30 @@ TEST_F(WorldLife, DeletedWorldStopsInOrder) {
   ASSERT_TRUE(AwaitTick(50));
 }
 
+TEST_F(WorldLife, WorldThatIsDeletedWhileNobodyLeadsLeavesNothing) {
+  constexpr char kSpace[] = "/api/v1/namespaces/test/";
+  const std::string claims = absl::StrCat(kSpace, "persistentvolumeclaims");
+  cluster_.StartControl(0);
+  Json spec = Spec();
+  spec["storage"] = {{"volumeClaim", {{"size", "1Gi"}}}};
+  spec["duration"] = "1000s";
+  Create(spec);
+  ASSERT_TRUE(AwaitTick(50));
+  EXPECT_EQ(cluster_.api().All(claims).size(), 2u);
+  cluster_.SignalControl(0, SIGKILL);
+  ASSERT_TRUE(Await([&] { return !cluster_.ControlRuns(0); }));
+  // Whatever it made for the World is the World's, but for events, which go after an hour.
+  int made = cluster_.api().Count("POST /apis/coordination.k8s.io/v1/namespaces/test/leases");
+  for (const char* kind : {"pods", "persistentvolumeclaims", "events"}) {
+    made += cluster_.api().Count(absl::StrCat("POST ", kSpace, kind));
+  }
+  EXPECT_EQ(cluster_.api().Count("POST "), made);
+  cluster_.api().Remove(absl::StrCat(kWorlds, "w"));
+  // Long before they would be killed: told to end, a server ends.
+  EXPECT_TRUE(Await([&] { return cluster_.processes() == 0; }, seconds(15)));
+  EXPECT_TRUE(Await([&] { return cluster_.Pods("w").empty() && cluster_.api().All(claims).empty(); }));
+}
+
 TEST_F(WorldLife, RefusedWorldSaysWhyAndRunsOnceItIsRight) {
   cluster_.StartControl(0);
   Json spec = Spec();
