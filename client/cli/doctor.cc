@@ -99,14 +99,18 @@ class Doctor {
       Say(Level::kFailure, absl::StrCat(server, " does not answer: ", error), "see aureole up for the servers");
       return;
     }
-    const v1::GetWorldResponse& world = watch->world();
-    Say(Level::kFine, absl::StrCat("world ", world.name(), " on ", world.endpoints_size(), " region servers"));
-    for (int r = 0; r < world.endpoints_size(); ++r) Server(world, r);
+    const v1::GetWorldResponse world = watch->world();
+    const size_t servers = client::EndpointsOf(world).size();
+    Say(Level::kFine, absl::StrCat("world ", world.name(), " on ", servers, " region servers"));
+    for (int r = 0; r < world.endpoints_size(); ++r) {
+      if (!world.endpoints(r).empty()) Server(world, r);
+    }
     std::this_thread::sleep_for(std::chrono::milliseconds(1200));  // each tells about five times a second
     const RunStatus status = watch->status();
     const double tick_ms = static_cast<double>(world.tick_us()) * 1e-3;
     for (size_t r = 0; r < status.regions.size(); ++r) {
       const RegionStatus& region = status.regions[r];
+      if (!region.member) continue;
       if (region.left || region.report.tick() == 0) {
         Say(Level::kFailure, absl::StrFormat("region %d does not tell its status %s", r, region.goodbye),
             "its tick stands still, or it is gone: see its log");
@@ -183,7 +187,7 @@ class Doctor {
       }
       least_ms = std::min(least_ms, std::chrono::duration<double, std::milli>(Clock::now() - asked).count());
     }
-    if (answer.name() != world.name() || answer.region() != r || answer.layout_epoch() != world.layout_epoch()) {
+    if (answer.name() != world.name() || answer.region() != r || answer.layout_epoch() < world.layout_epoch()) {
       Say(Level::kFailure,
           absl::StrCat("region ", r, ", ", endpoint, ", serves region ", answer.region(), " of world ", answer.name(),
                        ", layout epoch ", answer.layout_epoch()),

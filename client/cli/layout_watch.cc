@@ -1,6 +1,8 @@
 #include "client/cli/layout_watch.h"
 
+#include <algorithm>
 #include <chrono>
+#include <iterator>
 #include <utility>
 
 #include "client/cli/connect.h"
@@ -10,6 +12,8 @@ namespace aureole {
 namespace {
 
 using Clock = std::chrono::steady_clock;
+
+constexpr std::chrono::milliseconds kListenAgain(500);
 
 }  // namespace
 
@@ -22,25 +26,24 @@ std::unique_ptr<LayoutWatch> LayoutWatch::Open(const std::string& server, std::s
     *error = s.error_message();
     return nullptr;
   }
-  return std::unique_ptr<LayoutWatch>(new LayoutWatch(std::move(world)));
+  return std::unique_ptr<LayoutWatch>(new LayoutWatch(server, world));
 }
 
-LayoutWatch::LayoutWatch(v1::GetWorldResponse world) : world_(std::move(world)) {
+LayoutWatch::LayoutWatch(const std::string& server, const v1::GetWorldResponse& world) {
   status_.stage = Stage::kRunning;
-  status_.regions.resize(static_cast<size_t>(world_.endpoints_size()));
-  for (size_t r = 0; r < status_.regions.size(); ++r) {
-    RegionStatus& region = status_.regions[r];
-    region.joined = region.ready = true;
-    region.endpoint = world_.endpoints(static_cast<int>(r));
-    region.reported = Clock::now();
-    contexts_.push_back(std::make_unique<grpc::ClientContext>());
-  }
-  for (size_t r = 0; r < status_.regions.size(); ++r) threads_.emplace_back([this, r] { Listen(r); });
+  Follow(world);
+  follower_ = std::make_unique<client::LayoutFollower>(server, world, GivenAccess(),
+                                                       [this](const v1::GetWorldResponse& now) { Follow(now); });
 }
 
 LayoutWatch::~LayoutWatch() {
-  for (const auto& c : contexts_) c->TryCancel();
-  for (std::thread& t : threads_) t.join();
+  follower_.reset();
+  for (auto& [region, listener] : listeners_) End(std::move(listener));
+}
+
+v1::GetWorldResponse LayoutWatch::world() const {
+  const std::lock_guard lock(mutex_);
+  return world_;
 }
 
 RunStatus LayoutWatch::status() const {
@@ -48,18 +51,65 @@ RunStatus LayoutWatch::status() const {
   return status_;
 }
 
-void LayoutWatch::Listen(size_t region) {
-  const auto stub =
-      v1::Simulation::NewStub(client::ChannelTo(world_.endpoints(static_cast<int>(region)), GivenAccess()));
-  const auto stream = stub->WatchLayout(contexts_[region].get(), {});
-  v1::LayoutUpdate update;
-  while (stream->Read(&update)) {
-    if (update.has_status()) Take(region, update.status());
+// A listener for each region that is there, at its endpoint.
+void LayoutWatch::Follow(const v1::GetWorldResponse& world) {
+  const auto endpoint_of = [&](size_t region) { return world.endpoints(static_cast<int>(region)); };
+  const auto regions = static_cast<size_t>(world.endpoints_size());
+  for (auto it = listeners_.begin(); it != listeners_.end();) {
+    const bool stays = it->first < regions && endpoint_of(it->first) == it->second->endpoint;
+    if (!stays) End(std::move(it->second));
+    it = stays ? std::next(it) : listeners_.erase(it);
   }
-  const grpc::Status s = stream->Finish();
   const std::lock_guard lock(mutex_);
-  status_.regions[region].left = true;
-  status_.regions[region].goodbye = s.error_message();
+  world_ = world;
+  status_.regions.resize(std::max(status_.regions.size(), regions));
+  for (size_t r = 0; r < status_.regions.size(); ++r) {
+    RegionStatus& region = status_.regions[r];
+    const std::string endpoint = r < regions ? endpoint_of(r) : "";
+    if (endpoint.empty() || listeners_.contains(r)) {
+      if (endpoint.empty()) region = {};
+      region.member = !endpoint.empty();
+      region.left |= endpoint.empty();
+      continue;
+    }
+    region = {};
+    region.joined = region.ready = true;
+    region.endpoint = endpoint;
+    region.reported = Clock::now();
+    Listener& listener = *(listeners_[r] = std::make_unique<Listener>());
+    listener.endpoint = endpoint;
+    listener.thread = std::thread([this, r, &listener] { Listen(r, &listener); });
+  }
+}
+
+void LayoutWatch::Listen(size_t region, Listener* listener) {
+  const auto stub = v1::Simulation::NewStub(client::ChannelTo(listener->endpoint, GivenAccess()));
+  std::unique_lock lock(mutex_);
+  while (!listener->ended) {
+    const auto context = listener->context = std::make_shared<grpc::ClientContext>();
+    lock.unlock();
+    const auto stream = stub->WatchLayout(context.get(), {});
+    v1::LayoutUpdate update;
+    while (stream->Read(&update)) {
+      if (update.has_status()) Take(region, update.status());
+    }
+    const grpc::Status s = stream->Finish();
+    lock.lock();
+    if (listener->ended) break;
+    status_.regions[region].left = true;
+    status_.regions[region].goodbye = s.error_message();
+    ended_changed_.wait_for(lock, kListenAgain, [&] { return listener->ended; });
+  }
+}
+
+void LayoutWatch::End(std::unique_ptr<Listener> listener) {
+  {
+    const std::lock_guard lock(mutex_);
+    listener->ended = true;
+    if (listener->context != nullptr) listener->context->TryCancel();
+  }
+  ended_changed_.notify_all();
+  listener->thread.join();
 }
 
 void LayoutWatch::Take(size_t region, const v1::RegionStatus& s) {
@@ -71,6 +121,7 @@ void LayoutWatch::Take(size_t region, const v1::RegionStatus& s) {
     r.bytes_per_second = static_cast<double>(s.bytes_sent() - r.report.bytes_sent()) / seconds;
   }
   r.reported = now;
+  r.left = false;
   r.frame.set_mean_ms(s.frame_mean_ms());
   r.frame.set_p99_ms(s.frame_p99_ms());
   r.frame.set_max_ms(s.frame_max_ms());

@@ -47,6 +47,9 @@ Total Sum(const RunStatus& status) {
   return t;
 }
 
+// Its server has ended, and no region is there.
+bool IsGone(const RegionStatus& r) { return r.left && !r.member; }
+
 const char* Name(Stage stage) {
   switch (stage) {
     case Stage::kJoining:
@@ -86,9 +89,10 @@ std::string HumanBytes(double bytes) {
 std::vector<std::string> TableLines(const Heading& heading, const RunStatus& status) {
   const Total total = Sum(status);
   const Tick tick = status.MinTick();
-  std::string first =
-      absl::StrFormat("%s: %s, %d region%s, %.1f s simulated", heading.world, Name(status.stage), status.regions.size(),
-                      status.regions.size() == 1 ? "" : "s", Seconds(heading, tick));
+  const auto regions =
+      std::count_if(status.regions.begin(), status.regions.end(), [](const RegionStatus& r) { return !IsGone(r); });
+  std::string first = absl::StrFormat("%s: %s, %d region%s, %.1f s simulated", heading.world, Name(status.stage),
+                                      regions, regions == 1 ? "" : "s", Seconds(heading, tick));
   if (heading.last_tick > 0) absl::StrAppendFormat(&first, " of %.1f", Seconds(heading, heading.last_tick));
   absl::StrAppendFormat(&first, ", %.2f of real time", total.real_time_factor);
   std::vector<std::string> lines = {first, ""};
@@ -97,6 +101,7 @@ std::vector<std::string> TableLines(const Heading& heading, const RunStatus& sta
                                   "transfers", "sent", "waits", "wait s", "violations"));
   for (size_t i = 0; i < status.regions.size(); ++i) {
     const RegionStatus& r = status.regions[i];
+    if (IsGone(r)) continue;
     lines.push_back(TableRow(absl::StrCat(i), r.report.tick(), r.report.real_time_factor(), r.report.bodies(),
                              r.report.awake(), r.frame, r.report.auras_told(), r.report.transfers(), r.bytes_per_second,
                              r.report.waits(), r.report.wait_us(), r.report.violations()));
@@ -112,7 +117,9 @@ std::vector<std::string> TableLines(const Heading& heading, const RunStatus& sta
 
 std::string ServersLine(const RunStatus& status) {
   std::vector<std::string> endpoints;
-  for (const RegionStatus& r : status.regions) endpoints.push_back(r.endpoint);
+  for (const RegionStatus& r : status.regions) {
+    if (!IsGone(r)) endpoints.push_back(r.endpoint);
+  }
   return absl::StrCat("servers: ", absl::StrJoin(endpoints, " "));
 }
 

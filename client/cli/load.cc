@@ -26,6 +26,7 @@
 #include "client/cli/exit_codes.h"
 #include "client/cli/flags.h"
 #include "client/src/channel.h"
+#include "client/src/layout_follower.h"
 #include "client/src/replica_decoder.h"
 #include "server/control/interrupts.h"
 
@@ -292,7 +293,7 @@ int RunLoad(const LoadOptions& options) {
   }
   std::vector<std::unique_ptr<Watcher>> watchers;
   for (int i = 0; i < options.clients; ++i) {
-    for (const std::string& endpoint : world.endpoints()) {
+    for (const std::string& endpoint : client::EndpointsOf(world)) {
       watchers.push_back(std::make_unique<Watcher>(endpoint, RequestOf(options, world, i)));
     }
   }

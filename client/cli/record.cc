@@ -7,6 +7,8 @@
 #include <chrono>
 #include <functional>
 #include <iostream>
+#include <limits>
+#include <map>
 #include <memory>
 #include <mutex>
 #include <thread>
@@ -54,8 +56,11 @@ class Recorder {
  public:
   Recorder(const RecordOptions& options, std::unique_ptr<McapWriter> file, v1::GetWorldResponse world)
       : options_(options), file_(std::move(file)), world_(std::move(world)) {
-    for (const std::string& endpoint : world_.endpoints()) channels_.push_back(Connect(endpoint));
-    hashed_.resize(channels_.size());
+    for (int r = 0; r < world_.endpoints_size(); ++r) {
+      if (world_.endpoints(r).empty()) continue;
+      channels_[r] = Connect(world_.endpoints(r));
+      hashed_[r] = 0;
+    }
   }
   ~Recorder() { Stop(); }
 
@@ -64,9 +69,12 @@ class Recorder {
     Write(kWorldTopic, world_, world_.tick());
     for (int lead = std::max(8, static_cast<int>(500'000 / world_.tick_us())), n = 0;; lead *= 4, ++n) {
       int64_t tick = 0;
-      for (const auto& channel : channels_) {
+      for (const auto& [region, channel] : channels_) {
         v1::GetWorldResponse now;
         if (const grpc::Status s = AskWorld(channel, false, &now); !s.ok()) return s;
+        if (now.layout_epoch() > world_.layout_epoch()) {
+          return {grpc::StatusCode::ABORTED, "the layout of the world has just changed; record again"};
+        }
         tick = std::max(tick, now.tick());
       }
       const grpc::Status s = StartAt(tick + lead);
@@ -104,7 +112,8 @@ class Recorder {
   // Simulated time for which all regions have told what they had to, s.
   double seconds() {
     const std::lock_guard lock(mutex_);
-    const int64_t tick = *std::min_element(hashed_.begin(), hashed_.end());
+    int64_t tick = std::numeric_limits<int64_t>::max();
+    for (const auto& [region, told] : hashed_) tick = std::min(tick, told);
     return tick <= from_ ? 0 : static_cast<double>((tick - from_) * world_.tick_us()) * 1e-6;
   }
   int64_t inputs() const { return inputs_; }
@@ -149,20 +158,22 @@ class Recorder {
 
   grpc::Status StartAt(int64_t tick) {
     struct Opened {
+      int region = -1;
       std::shared_ptr<grpc::ClientContext> context;
       std::unique_ptr<grpc::ClientReader<v1::Recorded>> stream;
       v1::Recorded first;
     };
     std::vector<Opened> opened;
     grpc::Status refusal;
-    for (size_t r = 0; r < channels_.size(); ++r) {
+    for (const auto& [region, channel] : channels_) {
       v1::RecordRequest request;
       request.set_from_tick(tick);
       request.set_hash_every(options_.hash_every);
-      request.set_inputs(r == 0);
+      request.set_inputs(opened.empty());
       Opened& o = opened.emplace_back();
+      o.region = region;
       o.context = NewContext();
-      o.stream = v1::Recording::NewStub(channels_[r])->Record(o.context.get(), request);
+      o.stream = v1::Recording::NewStub(channel)->Record(o.context.get(), request);
     }
     for (Opened& o : opened) {
       if (!refusal.ok()) o.context->TryCancel();
@@ -184,16 +195,16 @@ class Recorder {
       return refusal;
     }
     from_ = tick;
-    for (size_t r = 0; r < opened.size(); ++r) {
-      threads_.emplace_back([this, r, o = std::make_shared<Opened>(std::move(opened[r]))] {
-        const int region = static_cast<int>(r);
+    for (Opened& each : opened) {
+      const int region = each.region;
+      threads_.emplace_back([this, region, o = std::make_shared<Opened>(std::move(each))] {
         std::string snapshot;
         TakeRecorded(region, o->first, &snapshot);
-        Read<v1::Recorded>(o->context, o->stream.get(), absl::StrCat("the recording of region ", r),
+        Read<v1::Recorded>(o->context, o->stream.get(), absl::StrCat("the recording of region ", region),
                            [&](const v1::Recorded& m) { TakeRecorded(region, m, &snapshot); });
       });
-      threads_.emplace_back([this, r] { ReadStatus(static_cast<int>(r)); });
-      if (options_.rate > 0) threads_.emplace_back([this, r] { ReadFrames(static_cast<int>(r)); });
+      threads_.emplace_back([this, region] { ReadStatus(region); });
+      if (options_.rate > 0) threads_.emplace_back([this, region] { ReadFrames(region); });
     }
     return grpc::Status::OK;
   }
@@ -214,14 +225,19 @@ class Recorder {
       ++inputs_;
     }
     if (!message.has_hashes()) return;
+    // What follows is the state on servers of which this recording has no snapshot.
+    if (message.hashes().layout_epoch() > world_.layout_epoch()) {
+      return Fail(absl::StrCat("the layout of the world has changed by tick ", message.hashes().tick(),
+                               "; what was recorded until then is whole; record again to go on"));
+    }
     Write(RegionTopic(region, "hashes"), message.hashes(), message.hashes().tick());
     const std::lock_guard lock(mutex_);
-    hashed_[static_cast<size_t>(region)] = message.hashes().tick();
+    hashed_.at(region) = message.hashes().tick();
   }
 
   void ReadStatus(int region) {
     const auto context = NewContext();
-    const auto stream = v1::Simulation::NewStub(channels_[static_cast<size_t>(region)])->WatchLayout(context.get(), {});
+    const auto stream = v1::Simulation::NewStub(channels_.at(region))->WatchLayout(context.get(), {});
     Read<v1::LayoutUpdate>(context, stream.get(), absl::StrCat("the status of region ", region),
                            [&](const v1::LayoutUpdate& m) {
                              if (m.has_status()) Write(RegionTopic(region, "status"), m.status(), m.status().tick());
@@ -233,8 +249,7 @@ class Recorder {
     v1::StreamReplicasRequest request;
     request.set_rate(options_.rate);
     request.set_velocities(true);
-    const auto stream =
-        v1::Simulation::NewStub(channels_[static_cast<size_t>(region)])->StreamReplicas(context.get(), request);
+    const auto stream = v1::Simulation::NewStub(channels_.at(region))->StreamReplicas(context.get(), request);
     Read<v1::ReplicaFrame>(context, stream.get(), absl::StrCat("the frames of region ", region),
                            [&](const v1::ReplicaFrame& m) { Write(RegionTopic(region, "frames"), m, m.tick()); });
   }
@@ -242,7 +257,7 @@ class Recorder {
   const RecordOptions options_;
   const std::unique_ptr<McapWriter> file_;
   const v1::GetWorldResponse world_;
-  std::vector<std::shared_ptr<grpc::Channel>> channels_;  // by region
+  std::map<int, std::shared_ptr<grpc::Channel>> channels_;  // by region; those that have left have none
   int64_t from_ = 0;
   std::atomic<bool> stopping_ = false;
   std::atomic<int64_t> inputs_ = 0;
@@ -251,7 +266,7 @@ class Recorder {
   std::vector<grpc::ClientContext*> contexts_;
   absl::Status written_;
   std::string failure_;
-  std::vector<int64_t> hashed_;  // last tick, by region
+  std::map<int, int64_t> hashed_;  // last tick, by region
 
   std::vector<std::thread> threads_;
 };

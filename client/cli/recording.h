@@ -30,7 +30,7 @@ struct RecordedRun {
   std::optional<v1::GetWorldResponse> world;
   std::vector<v1::Snapshot> snapshots;
   std::vector<v1::Input> inputs;
-  // The bodies' hashes by tick, where all regions have told theirs.
+  // The bodies' hashes by tick, where all regions have told theirs, by the layout with which the recording begins.
   std::map<int64_t, std::map<uint64_t, uint64_t>> hashes;
 };
 absl::StatusOr<RecordedRun> ReadRecording(const std::string& path);

@@ -17,6 +17,7 @@
 #include "client/cli/output_directory.h"
 #include "client/cli/recording.h"
 #include "client/cli/svg_plot.h"
+#include "client/src/layout_follower.h"
 #include "client/src/replica_decoder.h"
 
 namespace aureole {
@@ -126,7 +127,7 @@ class Report {
   static std::string RegionName(int region) { return absl::StrCat("region ", region); }
 
   double Seconds(int64_t tick) const { return static_cast<double>((tick - first_) * world_.tick_us()) * 1e-6; }
-  bool Whole(const Energy& e) const { return e.regions == world_.endpoints_size(); }
+  bool Whole(const Energy& e) const { return e.regions == static_cast<int>(client::EndpointsOf(world_).size()); }
 
   // From here on time is told from the first tick of what is charted.
   double Reach(int64_t tick) {

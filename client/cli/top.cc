@@ -26,6 +26,7 @@ Json StatusJson(const RunStatus& status) {
   Json regions = Json::array();
   for (size_t i = 0; i < status.regions.size(); ++i) {
     const RegionStatus& r = status.regions[i];
+    if (!r.member) continue;
     regions.push_back(
         {{"region", i},
          {"server", r.endpoint},
@@ -69,7 +70,8 @@ int RunTop(const TopOptions& o) {
     std::cerr << "--server " << o.server << ": no region server answers there (" << error << ")\n";
     return kExitBadInput;
   }
-  const Heading heading{watch->world().name(), watch->world().tick_us(), 0};
+  const v1::GetWorldResponse world = watch->world();
+  const Heading heading{world.name(), world.tick_us(), 0};
   const bool terminal = !o.json && isatty(STDOUT_FILENO) != 0;
   const auto every = terminal ? std::chrono::milliseconds(200) : std::chrono::milliseconds(1000);
   Screen screen(stdout);

@@ -5,6 +5,7 @@
 #include <cmath>
 #include <condition_variable>
 #include <limits>
+#include <map>
 #include <mutex>
 #include <random>
 #include <thread>
@@ -13,6 +14,7 @@
 #include "aureole/v1/simulation.grpc.pb.h"
 #include "client/src/channel.h"
 #include "client/src/convert.h"
+#include "client/src/layout_follower.h"
 #include "client/src/push_sender.h"
 #include "client/src/region_watch.h"
 #include "client/src/replica_merger.h"
@@ -26,6 +28,7 @@ constexpr double kLongestExtrapolation = 0.25;  // s
 // A step of the servers' time against ours that is followed at once; smaller ones are smoothed.
 constexpr double kJump = 0.25;  // s
 constexpr double kSmoothing = 0.05;
+constexpr std::chrono::milliseconds kAskAgain(50);
 
 uint64_t RandomClient() {
   std::random_device device;
@@ -110,20 +113,28 @@ Body At(uint64_t id, const MergedBody& b, double tick, double tick_seconds) {
 }  // namespace
 
 struct Client::Impl {
-  Impl(World w, std::vector<std::string> endpoints, Access a)
-      : world(std::move(w)),
+  Impl(const std::string& server, const v1::GetWorldResponse& told, Access a)
+      : tick_seconds(WorldFrom(told).tick_seconds),
         access(std::move(a)),
-        pushes(std::move(endpoints), RandomClient(), access),
-        calls_client(RandomClient()) {}
+        pushes(EndpointsOf(told), RandomClient(), access),
+        calls_client(RandomClient()),
+        world(WorldFrom(told)),
+        follower(server, told, access, [this](const v1::GetWorldResponse& now) { TakeLayout(now); }) {}
 
+  World Layout() const;
+  void TakeLayout(const v1::GetWorldResponse& told);
+  void FollowStreams();
+  void FollowWatches(const World& now);
   void OnFrame(int32_t region, const v1::ReplicaFrame& frame, const ReplicaDecoder& decoder, bool fresh);
   void Follow(int64_t tick);
   int64_t OldestTick() const;
+  grpc::Status CastRays(const World& now, const v1::CastRaysRequest& request,
+                        std::chrono::system_clock::time_point deadline, v1::CastRaysResponse* nearest) const;
   template <class Request, class Response>
   Status Call(grpc::Status (v1::Simulation::Stub::*method)(grpc::ClientContext*, const Request&, Response*),
               const Request& request, Response* response, double timeout_seconds);
 
-  const World world;
+  const double tick_seconds;
   const Access access;
   PushSender pushes;
 
@@ -134,22 +145,91 @@ struct Client::Impl {
 
   mutable std::mutex mutex;
   mutable std::condition_variable changed;
+  World world;  // by the newest layout
   ReplicaMerger merger;
   std::unordered_map<uint64_t, std::shared_ptr<const Look>> looks;
   struct Stream {
     int64_t tick = 0;
+    std::string endpoint;
     bool complete = false;
     double real_time_factor = 1;
   };
-  std::vector<Stream> streams;
+  std::map<int32_t, Stream> streams;  // by region: those of the layout, once anything is watched
   Counts counts;
   // Simulated time of the servers less ours, s.
   double offset = std::numeric_limits<double>::quiet_NaN();
   int64_t newest = 0;
 
-  std::mutex watches_mutex;
-  std::vector<std::unique_ptr<RegionWatch>> watches;  // last: ends first
+  std::mutex watches_mutex;  // before `mutex`
+  std::optional<v1::StreamReplicasRequest> wanted;
+  std::map<int32_t, std::unique_ptr<RegionWatch>> watches;  // ends before what its frames go to
+
+  LayoutFollower follower;  // last: ends first
 };
+
+World Client::Impl::Layout() const {
+  const std::lock_guard lock(mutex);
+  return world;
+}
+
+// The follower's thread.
+void Client::Impl::TakeLayout(const v1::GetWorldResponse& told) {
+  pushes.Follow(EndpointsOf(told));
+  const World now = WorldFrom(told);
+  const std::lock_guard watching(watches_mutex);
+  // No frame comes of a region once it is known to be elsewhere, or nowhere.
+  std::erase_if(watches, [&](const auto& w) {
+    const auto region = static_cast<size_t>(w.first);
+    return region >= now.regions.size() || now.regions[region].endpoint != w.second->endpoint();
+  });
+  {
+    const std::lock_guard lock(mutex);
+    world = now;
+    if (!streams.empty()) FollowStreams();
+  }
+  changed.notify_all();
+  if (wanted.has_value()) FollowWatches(now);
+}
+
+// Holds the mutex. What a region that comes will tell first, another one has told until now.
+void Client::Impl::FollowStreams() {
+  const int64_t oldest = OldestTick();
+  std::vector<int32_t> regions;
+  for (size_t r = 0; r < world.regions.size(); ++r) {
+    if (!world.regions[r].endpoint.empty()) regions.push_back(static_cast<int32_t>(r));
+  }
+  std::map<int32_t, Stream> now;
+  for (int32_t r : regions) {
+    const auto known = streams.find(r);
+    Stream& stream = now[r];
+    if (known != streams.end()) {
+      stream = known->second;
+    } else {
+      stream.tick = oldest;
+    }
+    const std::string& endpoint = world.regions[static_cast<size_t>(r)].endpoint;
+    if (std::exchange(stream.endpoint, endpoint) != endpoint) stream.complete = false;
+  }
+  streams = std::move(now);
+  merger.Follow(world.layout_epoch, regions);
+}
+
+// Holds the watches' mutex. A stream to each region that has none.
+void Client::Impl::FollowWatches(const World& now) {
+  for (size_t r = 0; r < now.regions.size(); ++r) {
+    const auto region = static_cast<int32_t>(r);
+    if (now.regions[r].endpoint.empty() || watches.contains(region)) continue;
+    RegionWatch::Events events;
+    events.frame = [this, region](const v1::ReplicaFrame& frame, const ReplicaDecoder& decoder, bool fresh) {
+      OnFrame(region, frame, decoder, fresh);
+    };
+    events.connection = [this](bool up) {
+      const std::lock_guard lock(mutex);
+      ++(up ? counts.connections : counts.lost_connections);
+    };
+    watches[region] = std::make_unique<RegionWatch>(now.regions[r].endpoint, access, *wanted, std::move(events));
+  }
+}
 
 void Client::Impl::OnFrame(int32_t region, const v1::ReplicaFrame& frame, const ReplicaDecoder& decoder, bool fresh) {
   const std::lock_guard lock(mutex);
@@ -158,18 +238,15 @@ void Client::Impl::OnFrame(int32_t region, const v1::ReplicaFrame& frame, const 
     uint64_t id = 0;
     for (uint64_t step : d.body()) looks[id += step] = look;
   }
-  merger.Apply(region, decoder, frame.more());
-  std::vector<LostBody> lost = merger.lost();
-  Stream& stream = streams[static_cast<size_t>(region)];
+  merger.Apply(region, decoder, frame);
+  Stream& stream = streams[region];
   stream.tick = decoder.tick();
   stream.real_time_factor = frame.real_time_factor();
   if (fresh) {
-    merger.Reconcile(region, decoder);
-    lost.insert(lost.end(), merger.lost().begin(), merger.lost().end());
     stream.complete = true;
     changed.notify_all();
   }
-  for (const LostBody& l : lost) looks.erase(l.body);
+  for (const LostBody& l : merger.lost()) looks.erase(l.body);
   ++counts.frames;
   counts.bytes += static_cast<int64_t>(frame.ByteSizeLong());
   Follow(decoder.tick());
@@ -178,7 +255,7 @@ void Client::Impl::OnFrame(int32_t region, const v1::ReplicaFrame& frame, const 
 void Client::Impl::Follow(int64_t tick) {
   if (tick <= newest) return;
   newest = tick;
-  const double now = static_cast<double>(tick) * world.tick_seconds - Seconds(Clock::now());
+  const double now = static_cast<double>(tick) * tick_seconds - Seconds(Clock::now());
   if (std::isnan(offset) || std::abs(now - offset) > kJump) {
     offset = now;
   } else {
@@ -188,7 +265,7 @@ void Client::Impl::Follow(int64_t tick) {
 
 int64_t Client::Impl::OldestTick() const {
   int64_t oldest = std::numeric_limits<int64_t>::max();
-  for (const Stream& s : streams) oldest = std::min(oldest, s.tick);
+  for (const auto& [region, s] : streams) oldest = std::min(oldest, s.tick);
   return streams.empty() ? 0 : oldest;
 }
 
@@ -198,16 +275,52 @@ Status Client::Impl::Call(grpc::Status (v1::Simulation::Stub::*method)(grpc::Cli
                           const Request& request, Response* response, double timeout_seconds) {
   const auto deadline = Deadline(timeout_seconds);
   for (size_t server = 0;; ++server) {
-    const std::string& endpoint = world.regions[server % world.regions.size()].endpoint;
+    const World now = Layout();
+    const std::string& endpoint = now.regions[server % now.regions.size()].endpoint;
+    if (endpoint.empty()) continue;  // another one is there
     const auto stub = v1::Simulation::NewStub(ChannelTo(endpoint, access));
     grpc::ClientContext context;
     context.set_deadline(deadline);
     response->Clear();
     const grpc::Status s = (stub.get()->*method)(&context, request, response);
     const bool retry = s.error_code() == grpc::StatusCode::UNAVAILABLE || s.error_code() == grpc::StatusCode::CANCELLED;
-    if (!retry || std::chrono::system_clock::now() + std::chrono::milliseconds(100) >= deadline) return FromGrpc(s);
-    std::this_thread::sleep_for(std::chrono::milliseconds(50));
+    if (!retry || std::chrono::system_clock::now() + 2 * kAskAgain >= deadline) return FromGrpc(s);
+    std::this_thread::sleep_for(kAskAgain);
   }
+}
+
+// Bodies may be on other servers than their place says, so all are asked, at once. UNAVAILABLE: there may be others.
+grpc::Status Client::Impl::CastRays(const World& now, const v1::CastRaysRequest& request,
+                                    std::chrono::system_clock::time_point deadline,
+                                    v1::CastRaysResponse* nearest) const {
+  struct Answer {
+    v1::CastRaysResponse response;
+    grpc::Status status;
+  };
+  std::vector<Answer> answers(now.regions.size());
+  std::vector<std::thread> threads;
+  for (size_t i = 0; i < answers.size(); ++i) {
+    if (now.regions[i].endpoint.empty()) continue;
+    threads.emplace_back([&, i] {
+      const auto stub = v1::Simulation::NewStub(ChannelTo(now.regions[i].endpoint, access));
+      grpc::ClientContext context;
+      context.set_deadline(deadline);
+      answers[i].status = stub->CastRays(&context, request, &answers[i].response);
+    });
+  }
+  for (std::thread& t : threads) t.join();
+  nearest->add_hits();
+  for (const Answer& a : answers) {
+    if (!a.status.ok()) return a.status;
+    if (a.response.hits_size() == 0) continue;  // was not asked: the region has left
+    if (a.response.layout_epoch() > now.layout_epoch) {
+      return {grpc::StatusCode::UNAVAILABLE, "the layout has changed, and the new one is not known yet"};
+    }
+    const v1::CastRaysResponse::Hit& h = a.response.hits(0);
+    const v1::CastRaysResponse::Hit& least = nearest->hits(0);
+    if (h.body() != 0 && (least.body() == 0 || h.distance() < least.distance())) *nearest->mutable_hits(0) = h;
+  }
+  return grpc::Status::OK;
 }
 
 Status Client::Connect(const std::string& server, std::unique_ptr<Client>* client, double timeout_seconds,
@@ -218,19 +331,14 @@ Status Client::Connect(const std::string& server, std::unique_ptr<Client>* clien
   context.set_wait_for_ready(true);
   v1::GetWorldResponse response;
   if (const grpc::Status s = stub->GetWorld(&context, {}, &response); !s.ok()) return FromGrpc(s);
-  World world = WorldFrom(response);
-  std::vector<std::string> endpoints{server};
-  for (const World::Region& r : world.regions) {
-    if (r.endpoint != server) endpoints.push_back(r.endpoint);
-  }
-  client->reset(new Client(std::make_unique<Impl>(std::move(world), std::move(endpoints), access)));
+  client->reset(new Client(std::make_unique<Impl>(server, response, access)));
   return {};
 }
 
 Client::Client(std::unique_ptr<Impl> impl) : impl_(std::move(impl)) {}
 Client::~Client() = default;
 
-const World& Client::world() const { return impl_->world; }
+World Client::world() const { return impl_->Layout(); }
 
 Status Client::Watch(const WatchOptions& options) {
   if (!(options.rate > 0 && options.rate <= 1000)) {
@@ -245,26 +353,15 @@ Status Client::Watch(const WatchOptions& options) {
   }
   const v1::StreamReplicasRequest request = RequestOf(options);
   const std::lock_guard watching(impl_->watches_mutex);
-  if (!impl_->watches.empty()) {
-    for (auto& watch : impl_->watches) watch->Want(request);
-    return {};
-  }
+  for (auto& [region, watch] : impl_->watches) watch->Want(request);
+  if (std::exchange(impl_->wanted, request).has_value()) return {};
+  World now;
   {
     const std::lock_guard lock(impl_->mutex);
-    impl_->streams.resize(impl_->world.regions.size());
+    impl_->FollowStreams();
+    now = impl_->world;
   }
-  for (size_t r = 0; r < impl_->world.regions.size(); ++r) {
-    RegionWatch::Events events;
-    events.frame = [impl = impl_.get(), r](const v1::ReplicaFrame& frame, const ReplicaDecoder& decoder, bool fresh) {
-      impl->OnFrame(static_cast<int32_t>(r), frame, decoder, fresh);
-    };
-    events.connection = [impl = impl_.get()](bool up) {
-      const std::lock_guard lock(impl->mutex);
-      ++(up ? impl->counts.connections : impl->counts.lost_connections);
-    };
-    impl_->watches.push_back(
-        std::make_unique<RegionWatch>(impl_->world.regions[r].endpoint, impl_->access, request, std::move(events)));
-  }
+  impl_->FollowWatches(now);
   return {};
 }
 
@@ -272,7 +369,7 @@ bool Client::WaitUntilComplete(double timeout_seconds) const {
   std::unique_lock lock(impl_->mutex);
   return impl_->changed.wait_for(lock, std::chrono::duration<double>(timeout_seconds), [this] {
     return !impl_->streams.empty() &&
-           std::all_of(impl_->streams.begin(), impl_->streams.end(), [](const Impl::Stream& s) { return s.complete; });
+           std::all_of(impl_->streams.begin(), impl_->streams.end(), [](const auto& s) { return s.second.complete; });
   });
 }
 
@@ -291,10 +388,8 @@ void Client::Sample(std::vector<Body>* bodies, double delay_seconds) const {
   {
     const std::lock_guard lock(impl_->mutex);
     const double seconds = Seconds(Clock::now()) + impl_->offset - delay_seconds;
-    const double tick = seconds / impl_->world.tick_seconds;
-    for (const auto& [id, body] : impl_->merger.bodies()) {
-      bodies->push_back(At(id, body, tick, impl_->world.tick_seconds));
-    }
+    const double tick = seconds / impl_->tick_seconds;
+    for (const auto& [id, body] : impl_->merger.bodies()) bodies->push_back(At(id, body, tick, impl_->tick_seconds));
   }
   std::sort(bodies->begin(), bodies->end(), [](const Body& x, const Body& y) { return x.id < y.id; });
 }
@@ -308,7 +403,7 @@ std::optional<Look> Client::LookOf(uint64_t body) const {
 double Client::real_time_factor() const {
   const std::lock_guard lock(impl_->mutex);
   double least = 1;
-  for (const Impl::Stream& s : impl_->streams) least = std::min(least, s.real_time_factor);
+  for (const auto& [region, s] : impl_->streams) least = std::min(least, s.real_time_factor);
   return least;
 }
 
@@ -341,7 +436,7 @@ Status Client::Spawn(const std::vector<NewBody>& bodies, std::vector<uint64_t>* 
   return s;
 }
 
-// Bodies may be on other servers than their place says, so all are asked, at once.
+// Again, while a server that was asked has left or is coming back, or one that was not asked has come.
 Status Client::CastRay(const Vec3& origin, const Vec3& direction, double length, RayHit* hit, double timeout_seconds) {
   v1::CastRaysRequest request;
   v1::CastRaysRequest::Ray* ray = request.add_rays();
@@ -352,33 +447,26 @@ Status Client::CastRay(const Vec3& origin, const Vec3& direction, double length,
     to->set_z(from.z);
   }
   ray->set_length(length);
-  struct Answer {
-    v1::CastRaysResponse response;
-    grpc::Status status;
-  };
-  std::vector<Answer> answers(impl_->world.regions.size());
-  std::vector<std::thread> threads;
-  for (size_t i = 0; i < answers.size(); ++i) {
-    threads.emplace_back([&, i] {
-      const auto stub = v1::Simulation::NewStub(ChannelTo(impl_->world.regions[i].endpoint, impl_->access));
-      grpc::ClientContext context;
-      context.set_deadline(Deadline(timeout_seconds));
-      answers[i].status = stub->CastRays(&context, request, &answers[i].response);
-    });
-  }
-  for (std::thread& t : threads) t.join();
+  const auto deadline = Deadline(timeout_seconds);
   *hit = {};
-  for (const Answer& a : answers) {
-    if (!a.status.ok()) return FromGrpc(a.status);
-    const v1::CastRaysResponse::Hit& h = a.response.hits(0);
-    if (h.body() == 0 || (hit->body != 0 && h.distance() >= hit->distance)) continue;
+  while (true) {
+    v1::CastRaysResponse nearest;
+    const World now = impl_->Layout();
+    const grpc::Status s = impl_->CastRays(now, request, deadline, &nearest);
+    const bool again = s.error_code() == grpc::StatusCode::UNAVAILABLE;
+    if (again && std::chrono::system_clock::now() + kAskAgain < deadline) {
+      std::this_thread::sleep_for(kAskAgain);
+      continue;
+    }
+    if (!s.ok()) return FromGrpc(s);
+    const v1::CastRaysResponse::Hit& h = nearest.hits(0);
     *hit = {h.body(),
             h.fixed(),
             h.distance(),
             {h.point().x(), h.point().y(), h.point().z()},
             {h.normal().x(), h.normal().y(), h.normal().z()}};
+    return {};
   }
-  return {};
 }
 
 Status Client::Remove(const std::vector<uint64_t>& bodies, int64_t* removed, double timeout_seconds) {

@@ -16,7 +16,7 @@ constexpr std::chrono::milliseconds kBackoff(100);
 }  // namespace
 
 PushSender::PushSender(std::vector<std::string> endpoints, uint64_t client, Access access)
-    : endpoints_(std::move(endpoints)), client_(client), access_(std::move(access)), thread_([this] { Run(); }) {}
+    : client_(client), access_(std::move(access)), endpoints_(std::move(endpoints)), thread_([this] { Run(); }) {}
 
 PushSender::~PushSender() {
   {
@@ -26,6 +26,13 @@ PushSender::~PushSender() {
   }
   changed_.notify_all();
   thread_.join();
+}
+
+void PushSender::Follow(std::vector<std::string> endpoints) {
+  const std::lock_guard lock(mutex_);
+  endpoints_ = std::move(endpoints);
+  const bool there = std::find(endpoints_.begin(), endpoints_.end(), serving_) != endpoints_.end();
+  if (!there && context_ != nullptr) context_->TryCancel();
 }
 
 void PushSender::Send(const Push& push) {
@@ -58,6 +65,7 @@ void PushSender::Cut() {
 // A stream is opened when there is something to send, and kept.
 void PushSender::Run() {
   for (size_t server = 0;; ++server) {
+    std::string endpoint;
     {
       std::unique_lock lock(mutex_);
       changed_.wait(lock, [this] { return ended_ || !pending_.empty(); });
@@ -65,8 +73,9 @@ void PushSender::Run() {
       context_ = std::make_shared<grpc::ClientContext>();
       stream_ended_ = false;
       unsent_ = pending_.size();
+      endpoint = serving_ = endpoints_[server % endpoints_.size()];
     }
-    Serve(endpoints_[server % endpoints_.size()]);
+    Serve(endpoint);
     std::unique_lock lock(mutex_);
     context_ = nullptr;
     changed_.wait_for(lock, kBackoff, [this] { return ended_; });

@@ -1,5 +1,5 @@
 // Sends pushes so that each acts once: in order, over one stream at a time, all that are not settled again after a lost
-// connection, to the next server.
+// connection, or from a server that has left, to the next server.
 #pragma once
 
 #include <condition_variable>
@@ -24,6 +24,8 @@ class PushSender {
   PushSender(std::vector<std::string> endpoints, uint64_t client, Access access = {});
   ~PushSender();
 
+  // From here on these are the servers, at least one. A stream to another one is given up.
+  void Follow(std::vector<std::string> endpoints);
   void Send(const Push& push);
   // False after the timeout.
   bool Flush(double timeout_seconds);
@@ -46,11 +48,12 @@ class PushSender {
   void Refuse(const Sent& sent, const grpc::Status& status);
   void Reject(uint64_t sequence, const std::string& reason);
 
-  const std::vector<std::string> endpoints_;
   const uint64_t client_;
   const Access access_;
 
   mutable std::mutex mutex_;
+  std::vector<std::string> endpoints_;
+  std::string serving_;  // where context_'s stream goes
   std::condition_variable changed_;
   std::deque<Pending> pending_;  // not settled; ascending
   size_t unsent_ = 0;            // how many of the last of these were not sent on this stream

@@ -27,6 +27,7 @@ class RegionWatch {
   RegionWatch(std::string endpoint, Access access, v1::StreamReplicasRequest request, Events events);
   ~RegionWatch();
 
+  const std::string& endpoint() const { return endpoint_; }
   // Changes the view, the rate or the level of detail.
   void Want(const v1::StreamReplicasRequest& request);
 

@@ -1,10 +1,12 @@
 // One world from the streams of all its servers: each body once, by its epoch, however its servers' frames overtake
-// each other.
+// each other, and while servers come and go.
 #pragma once
 
 #include <array>
 #include <cstdint>
+#include <optional>
 #include <unordered_map>
+#include <unordered_set>
 #include <vector>
 
 #include "client/src/replica_decoder.h"
@@ -25,14 +27,16 @@ struct MergedBody {
 
 class ReplicaMerger {
  public:
-  // After `decoder`, of this region's stream, has taken a frame. `more`: that frame did not hold all that is in view.
-  void Apply(int32_t region, const ReplicaDecoder& decoder, bool more = false);
-  // After a new stream to this region has told all that is in view: what the old one told and the new one does not have
-  // is gone.
-  void Reconcile(int32_t region, const ReplicaDecoder& decoder);
+  // From here on these regions are the world, by the layout of this epoch; no frame of another one comes. Called before
+  // the first frame, and when servers have come or gone. What one that has left told stays as it was until another
+  // region tells it, or all have told everything and none has it.
+  void Follow(uint64_t layout_epoch, const std::vector<int32_t>& regions);
+  // After `decoder`, of this region's stream, has taken this frame. A new stream may begin at any time: what the old
+  // one told and the new one does not have stays like that of a region that has left.
+  void Apply(int32_t region, const ReplicaDecoder& decoder, const v1::ReplicaFrame& frame);
 
   const std::unordered_map<uint64_t, MergedBody>& bodies() const { return bodies_; }
-  // Of the last Apply or Reconcile: bodies that are gone from the merged world.
+  // Of the last Apply: bodies that are gone from the merged world.
   const std::vector<LostBody>& lost() const { return lost_; }
 
  private:
@@ -42,13 +46,28 @@ class ReplicaMerger {
     uint32_t epoch = 0;
     int64_t tick = 0;
   };
+  struct Told {
+    int64_t tick = 0;  // of the last frame
+    uint64_t layout_epoch = 0;
+    // Of the present stream: the first and the last tick at which it had told all that is in view.
+    std::optional<int64_t> whole_since, whole;
+  };
+  void Take(int32_t region, const ReplicaDecoder& decoder, uint64_t body);
+  void HandOver(int32_t region, const v1::ReplicaFrame& frame, const LostBody& lost);
   void Settle(int32_t region, const ReplicaDecoder& decoder);
+  void Reconcile(int32_t region, const ReplicaDecoder& decoder);
+  void LoseOrphans();
+  void Orphan(uint64_t body);
   void Lose(const LostBody& lost);
   void ForgetRemoved();
 
   std::unordered_map<uint64_t, MergedBody> bodies_;
   std::unordered_map<uint64_t, Transit> transits_;
-  std::unordered_map<int32_t, int64_t> ticks_;  // of each region's last frame
+  // Bodies of which no stream can say where they are now: the one that would have said it has ended.
+  std::unordered_set<uint64_t> orphans_;
+  std::optional<int64_t> settles_at_;  // who is an orphan still when all regions have told this tick is gone
+  uint64_t layout_epoch_ = 0;
+  std::unordered_map<int32_t, Told> regions_;
   // Bodies that were removed, and when: a frame of another region that comes late may still tell of them.
   std::unordered_map<uint64_t, int64_t> removed_;
   std::vector<LostBody> lost_;

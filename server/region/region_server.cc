@@ -123,8 +123,9 @@ struct Process {
   std::unique_ptr<ControlStream> control;
   std::optional<v1::Report> last_report;  // of a run that is over
   std::unique_ptr<HostedRegion> hosted;
-  uint64_t told_epoch = 0;     // of the layout that clients know; of the tick thread
-  uint64_t control_epoch = 0;  // the highest that was heard
+  uint64_t told_epoch = 0;               // of the layout that clients know; of the tick thread
+  std::atomic<bool> peer_moved = false;  // since they were told of it
+  uint64_t control_epoch = 0;            // the highest that was heard
   bool control_lost = false;
   int64_t start_unix_us = 0;  // 0: not started
   std::chrono::steady_clock::time_point join_again = std::chrono::steady_clock::time_point::max();
@@ -184,11 +185,12 @@ v1::FromRegion LayoutOutcomeOf(const InputOutcome& outcome) {
   return message;
 }
 
-// The tick thread. Clients hear of a layout that has just come into force; those of a region that has left have to say
-// elsewhere what has not acted yet.
+// The tick thread. Clients hear of a layout that has just come into force, and of servers that are elsewhere; those of
+// a region that has left have to say elsewhere what has not acted yet.
 void Process::FollowLayout(const Region& region) {
-  if (region.phase() == Phase::kLeft) simulation.inputs().Stop();
-  if (region.layout_epoch() == told_epoch) return;
+  if (region.phase() == Phase::kLeft) simulation.Leave();
+  const bool moved = peer_moved.exchange(false);
+  if (region.layout_epoch() == told_epoch && !moved) return;
   told_epoch = region.layout_epoch();
   std::vector<std::string> endpoints = hosted->links().Endpoints();
   const auto self = static_cast<size_t>(region.self());
@@ -292,6 +294,7 @@ absl::Status Process::Handle(const v1::ToRegion& message) {
     spdlog::info("region {} is incarnation {} now, at {}", message.peer_moved().region(),
                  message.peer_moved().incarnation(), message.peer_moved().endpoint());
     hosted->PeerMoved(message.peer_moved());
+    peer_moved = true;
   } else if (message.has_peer_left()) {
     if (hosted == nullptr) return absl::FailedPreconditionError("a peer has left before the assignment");
     spdlog::info("region {} has left", message.peer_left().region());

@@ -12,8 +12,14 @@ namespace aureole {
 // One call. What it could not take in time is replaced by what is newer.
 class LayoutService::Stream final : public MessageStream<v1::LayoutUpdate> {
  public:
-  Stream(LayoutService* service, grpc::CallbackServerContext* context, bool auras)
-      : MessageStream(&service->mutex_, context), service_(service), auras_(auras) {}
+  Stream(LayoutService* service, grpc::CallbackServerContext* context, const v1::WatchLayoutRequest& request)
+      : MessageStream(&service->mutex_, context),
+        service_(service),
+        auras_(request.auras() && !request.layout_only()),
+        siblings_(request.layout_only() ? &service->layout_only_ : &service->streams_) {
+    siblings_->insert(this);
+    service_->want_auras_ += auras_ ? 1 : 0;
+  }
 
   bool auras() const { return auras_; }
 
@@ -36,27 +42,31 @@ class LayoutService::Stream final : public MessageStream<v1::LayoutUpdate> {
     return true;
   }
   void Leave() override {
-    service_->streams_.erase(this);
+    siblings_->erase(this);
     service_->want_auras_ -= auras_ ? 1 : 0;
   }
 
   LayoutService* const service_;
   const bool auras_;
+  std::set<Stream*>* const siblings_;
   v1::LayoutUpdate next_;
   bool waiting_ = false;  // next_ is something
 };
 
 grpc::ServerWriteReactor<v1::LayoutUpdate>* LayoutService::Watch(grpc::CallbackServerContext* context,
                                                                  const v1::WatchLayoutRequest& request) {
-  auto* stream = new Stream(this, context, request.auras());
   const std::lock_guard lock(mutex_);
-  streams_.insert(stream);
-  want_auras_ += request.auras() ? 1 : 0;
+  auto* stream = new Stream(this, context, request);
   if (!serving_) {
     stream->End(NoRegion());
   } else if (streams_.size() > kMostStreams) {
     stream->End(Refusal(grpc::StatusCode::RESOURCE_EXHAUSTED, v1::BUSY, "",
-                        absl::StrCat("the server tells its status to at most ", kMostStreams, " clients; try later")));
+                        absl::StrCat("the server tells its status to at most ", kMostStreams,
+                                     " clients; try later, or set layout_only")));
+  } else if (layout_only_.size() > kMostLayoutOnly) {
+    stream->End(
+        Refusal(grpc::StatusCode::RESOURCE_EXHAUSTED, v1::BUSY, "",
+                absl::StrCat("the server tells its layout to at most ", kMostLayoutOnly, " clients; ask another")));
   } else {
     stream->OfferWorld(world_);
   }
@@ -72,13 +82,17 @@ void LayoutService::Serve(const v1::GetWorldResponse& world) {
 void LayoutService::Follow(const v1::GetWorldResponse& world) {
   const std::lock_guard lock(mutex_);
   world_ = world;
-  for (Stream* s : streams_) s->OfferWorld(world_);
+  for (const auto* streams : {&streams_, &layout_only_}) {
+    for (Stream* s : *streams) s->OfferWorld(world_);
+  }
 }
 
 void LayoutService::Stop() {
   const std::lock_guard lock(mutex_);
   serving_ = false;
-  for (Stream* s : streams_) s->End(RegionGivenUp());
+  for (const auto* streams : {&streams_, &layout_only_}) {
+    for (Stream* s : *streams) s->End(RegionGivenUp());
+  }
 }
 
 void LayoutService::AfterTick(const Region& region) {

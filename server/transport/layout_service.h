@@ -21,7 +21,8 @@ class LayoutService {
  public:
   // Boxes of one status, and how old they may be.
   static constexpr size_t kMostAuras = 4096;
-  static constexpr size_t kMostStreams = 64;
+  static constexpr size_t kMostStreams = 64;       // with status
+  static constexpr size_t kMostLayoutOnly = 4096;  // and without
   static constexpr std::chrono::milliseconds kAuraEvery{200};
 
   // From any thread; the calls of clients.
@@ -47,7 +48,7 @@ class LayoutService {
   std::mutex mutex_;
   bool serving_ = false;
   v1::GetWorldResponse world_;
-  std::set<Stream*> streams_;
+  std::set<Stream*> streams_, layout_only_;
   std::atomic<int> want_auras_ = 0;  // how many streams
 
   // Of the tick thread.

@@ -40,6 +40,7 @@ class RayService::Call final : public grpc::ServerUnaryReactor {
 
   void Answer(const Region& region) {
     response_->set_tick(region.tick());
+    response_->set_layout_epoch(region.layout_epoch());
     for (const ClientRay& ray : rays_) {
       v1::CastRaysResponse::Hit* out = response_->add_hits();
       const std::optional<RayHit> hit = region.engine().CastRay(ray.from, ray.to);

@@ -20,6 +20,7 @@ v1::StateHashes HashesOf(const Region& region) {
   v1::StateHashes out;
   out.set_tick(region.tick());
   out.set_region(region.self());
+  out.set_layout_epoch(region.layout_epoch());
   BodyId last = 0;
   for (BodyId id : region.engine().Ids()) {
     out.add_body(id - std::exchange(last, id));

@@ -134,6 +134,11 @@ void SimulationService::Follow(const Region& region, const std::vector<std::stri
   if (world_.SerializeAsString() != before) layout_.Follow(world_);
 }
 
+void SimulationService::Leave() {
+  inputs_.Stop();
+  rays_.Stop();
+}
+
 void SimulationService::Stop() {
   inputs_.Stop();
   rays_.Stop();

@@ -54,6 +54,8 @@ class SimulationService final : public SimulationCalls {
   void Serve(const v1::Assignment& assignment, const World& world);
   // The layout that is in force in `region`, and where its members are, by region; clients that watch it are told.
   void Follow(const Region& region, const std::vector<std::string>& endpoints);
+  // The region has left: what clients want of it is for others, and they are told so.
+  void Leave();
   // Ends all calls.
   void Stop();
   // After each tick, from the tick thread; `bodies`: that this region owns. Cost: ReplicaPublisher::AfterTick.

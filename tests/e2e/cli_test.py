@@ -307,6 +307,7 @@ class Clients(Cli):
             line = up.stdout.readline()
             self.assertTrue(line, "the run ended")
         self.servers = line.split()[1:]
+        self.control = up.stdout.readline().split()[-1]
         # Read on, so that the run is not held up.
         threading.Thread(target=up.stdout.read, daemon=True).start()
         self.up = up
@@ -405,6 +406,38 @@ class Clients(Cli):
         code, out, _ = self.run_cli("doctor", "--server", "127.0.0.1:1")
         self.assertEqual(code, 1)
         self.assertIn("FAILURE", out)
+
+    def test_top_follows_a_layout_and_a_recording_ends_where_it_changes(self):
+        file = self.path / "run.mcap"
+        record = self.start("record", "--server", self.servers[2], "--out", file)
+        top = self.start("top", "--server", self.servers[0], "--json")
+        wait_for(lambda: file.exists() and file.stat().st_size > 100_000, "the snapshots are recorded")
+
+        def shown_until(regions):
+            for line in top.stdout:
+                shown = json.loads(line)["regions"]
+                if len(shown) == regions and all(r["up"] and r["tick"] > 0 for r in shown):
+                    return {r["server"] for r in shown}
+            self.fail(f"top ended before it showed {regions} regions: {top.stderr.read()}")
+
+        self.assertEqual(shown_until(4), set(self.servers))
+        for columns, rows in ((3, 2), (2, 1)):
+            code, _, err = self.run_cli("resize", "--control", self.control, "--columns", columns, "--rows", rows)
+            self.assertEqual(code, 0, err)
+            shown = shown_until(columns * rows)
+        top.send_signal(signal.SIGINT)
+        self.assertEqual(top.wait(DEADLINE_S), 0)
+        out, err = record.communicate(timeout=DEADLINE_S)
+        self.assertEqual(record.returncode, 1, err)
+        self.assertIn("the layout of the world has changed", err)
+        code, out, err = self.run_cli("replay", file, "--verify", "--json")
+        self.assertEqual(code, 0, out + err)
+        self.assertTrue(json.loads(out)["equal"], "what was recorded until then is whole")
+        code, out, err = self.run_cli("doctor", "--server", min(shown), "--json")
+        self.assertEqual(code, 0, out + err)
+        findings = json.loads(out)
+        self.assertNotIn("FAILURE", [f["level"] for f in findings])
+        self.assertIn("world demo on 2 region servers", [f["what"] for f in findings])
 
     def test_bad_input_is_named(self):
         for arguments, word in ((["spawn", "--shape", "cube:1", "--position", "0,0,0"], "--shape"),

@@ -15,6 +15,7 @@
 
 #include "aureole/v1/recording.grpc.pb.h"
 #include "aureole/v1/simulation.grpc.pb.h"
+#include "server/transport/layout_service.h"
 #include "server/transport/world_json.h"
 #include "tests/e2e/running_world.h"
 
@@ -116,6 +117,34 @@ TEST(Layout, StatusWithoutAurasHasNone) {
     }
     with_context.TryCancel();
     context.TryCancel();
+  });
+}
+
+TEST(Layout, ManyMayWatchTheLayoutAloneAndAreToldNoStatus) {
+  PlayIn(Sliding(), 2, [](const std::vector<std::string>& endpoints) {
+    constexpr size_t kMany = LayoutService::kMostStreams + 8;
+    const auto stub = Connect(endpoints[0]);
+    v1::WatchLayoutRequest layout_only;
+    layout_only.set_layout_only(true);
+    layout_only.set_auras(true);
+    std::vector<grpc::ClientContext> contexts(kMany + 1);
+    std::vector<std::unique_ptr<grpc::ClientReader<v1::LayoutUpdate>>> streams;
+    v1::LayoutUpdate update;
+    for (size_t i = 0; i < kMany; ++i) {
+      SetDeadline(&contexts[i]);
+      streams.push_back(stub->WatchLayout(&contexts[i], layout_only));
+      ASSERT_TRUE(streams.back()->Read(&update)) << i;
+      EXPECT_EQ(update.world().endpoints_size(), 2);
+      EXPECT_FALSE(update.has_status());
+    }
+    // One with status has its place, and is told one while the others are told nothing.
+    SetDeadline(&contexts[kMany]);
+    const auto with = stub->WatchLayout(&contexts[kMany], {});
+    for (int n = 0; n < 3; ++n) ASSERT_TRUE(with->Read(&update));
+    EXPECT_TRUE(update.has_status());
+    for (grpc::ClientContext& c : contexts) c.TryCancel();
+    EXPECT_FALSE(streams[0]->Read(&update));
+    for (auto& s : streams) EXPECT_EQ(s->Finish().error_code(), grpc::StatusCode::CANCELLED);
   });
 }
 

@@ -6,6 +6,7 @@
 #include <condition_variable>
 #include <map>
 #include <memory>
+#include <numeric>
 #include <set>
 #include <thread>
 
@@ -101,6 +102,9 @@ class Watched {
       while (publishers_.back()->subscribers() == 0) std::this_thread::yield();
     }
     history_.resize(static_cast<size_t>(n));
+    std::vector<RegionId> all(static_cast<size_t>(n));
+    std::iota(all.begin(), all.end(), 0);
+    merger_.Follow(1, all);
   }
 
   // Steps all regions to tick n, and publishes its state.
@@ -126,7 +130,7 @@ class Watched {
         uint64_t id = 0;
         for (uint64_t step : d.body()) described_.insert(id += step);
       }
-      merger_.Apply(r, decoder(r), frame.more());
+      merger_.Apply(r, decoder(r), frame);
       lost->insert(lost->end(), merger_.lost().begin(), merger_.lost().end());
     }
   }

@@ -43,14 +43,14 @@ const newer = (a, b) => (!a || (b && b.epoch > a.epoch) ? b : a);
 class Merged {
   constructor(regions) {
     // Per region: the tick of its newest complete frame, and what it tells of its bodies, by id.
-    this.regions = Array.from({ length: regions }, () => ({ tick: 0, frame: '0', bodies: new Map() }));
+    this.regions = new Map(regions.map((region) => [region, { tick: 0, frame: '0', bodies: new Map() }]));
     this.moves = new Map(); // bodies on their way: a region has told where they went, the other one not yet of them
     this.removed = new Map(); // the tick of it; until all regions are past it, one may still tell of the body
     this.descriptions = new Map();
   }
 
   read(frame) {
-    const region = this.regions[frame.region];
+    const region = this.regions.get(frame.region);
     const tick = Number(frame.tick);
     if (frame.base_tick === '0') region.bodies.clear();
     else if (frame.base_tick !== region.frame) throw new Error(`region ${frame.region}: a frame was lost`);
@@ -131,7 +131,7 @@ class Merged {
   // Forgets what all have caught up with.
   settle() {
     for (const [id, { to, tick }] of this.moves) {
-      if (this.regions[to].tick < tick) continue;
+      if (this.regions.get(to).tick < tick) continue;
       this.moves.delete(id);
       if (!this.find(id)) this.descriptions.delete(id); // removed on its way
     }
@@ -142,14 +142,14 @@ class Merged {
 
   // The last tick that all regions have told; 0 until all have.
   tick() {
-    return Math.min(...this.regions.map((region) => region.tick));
+    return Math.min(...[...this.regions.values()].map((region) => region.tick));
   }
 
   // Where two regions tell of a body, the one with the higher epoch is right.
   find(id) {
     if (this.removed.has(id)) return undefined;
     let found = this.moves.get(id)?.last;
-    for (const region of this.regions) {
+    for (const region of this.regions.values()) {
       const body = region.bodies.get(id);
       if (body && (!found || body.epoch > found.epoch)) found = { ...body, tick: region.tick };
     }
@@ -158,7 +158,7 @@ class Merged {
 
   all() {
     const every = new Set(this.moves.keys());
-    for (const { bodies } of this.regions) for (const id of bodies.keys()) every.add(id);
+    for (const { bodies } of this.regions.values()) for (const id of bodies.keys()) every.add(id);
     return [...every].map((id) => this.find(id)).filter((body) => body);
   }
 }
@@ -220,8 +220,9 @@ function call(client, method, request, send) {
 class World {
   constructor({ connect }, { endpoints, layout_epoch }, frames) {
     this.frames = frames;
-    this.merged = new Merged(endpoints.length);
-    this.clients = endpoints.map(connect);
+    const there = [...endpoints.keys()].filter((region) => endpoints[region] !== ''); // others have left
+    this.merged = new Merged(there);
+    this.clients = there.map((region) => connect(endpoints[region]));
     this.news = new EventEmitter();
     for (const client of this.clients) {
       const stream = client.StreamReplicas({});

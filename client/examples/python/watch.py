@@ -106,7 +106,7 @@ class Merged:
     """What the streams of all regions tell, as one world."""
 
     def __init__(self, regions):
-        self.regions = [Region() for _ in range(regions)]
+        self.regions = {region: Region() for region in regions}
         self.moves = {}
         self.removed = {}  # the tick of it; until all regions are past it, one may still tell of the body
         self.descriptions = {}
@@ -190,19 +190,19 @@ class Merged:
 
     def tick(self):
         """The last tick that all regions have told; 0 until all have."""
-        return min(region.tick for region in self.regions)
+        return min(region.tick for region in self.regions.values())
 
     def find(self, body):
         """Where two regions tell of a body, the one with the higher epoch is right."""
         if body in self.removed:
             return None
-        told = [dataclasses.replace(r.bodies[body], tick=r.tick) for r in self.regions if body in r.bodies]
+        told = [dataclasses.replace(r.bodies[body], tick=r.tick) for r in self.regions.values() if body in r.bodies]
         if body in self.moves and self.moves[body].last:
             told.append(self.moves[body].last)
         return max(told, key=lambda it: it.epoch, default=None)
 
     def all(self):
-        every = set(self.moves).union(*(region.bodies for region in self.regions))
+        every = set(self.moves).union(*(region.bodies for region in self.regions.values()))
         return [it for it in map(self.find, every) if it]
 
 
@@ -251,8 +251,10 @@ class World:
         self.simulation = interface.simulation
         about = connect(server).GetWorld(self.simulation.GetWorldRequest(), timeout=10)
         self.layout_epoch = about.layout_epoch
-        self.servers = [connect(endpoint) for endpoint in about.endpoints]
-        self.merged = Merged(len(self.servers))
+        # A region that has left has none.
+        servers = {region: connect(endpoint) for region, endpoint in enumerate(about.endpoints) if endpoint}
+        self.servers = list(servers.values())
+        self.merged = Merged(servers)
         self.changed = threading.Condition()
         self.failure = None
         self.frames = self.bytes = 0

@@ -1,7 +1,8 @@
 // The client library of Aureole: a live copy of a world that many servers simulate, and a way to act on it.
 //
 // Connect to any region server. The client finds the others, keeps one stream to each, merges what they tell, goes on
-// after lost connections, and sends inputs that act exactly once. Bodies change servers without anybody noticing.
+// after lost connections, and sends inputs that act exactly once. Bodies change servers without anybody noticing, and
+// so do servers come, go, and come back elsewhere: as long as one that the client knows answers, it finds the others.
 //
 //   std::unique_ptr<aureole::client::Client> client;
 //   aureole::client::Status s = aureole::client::Client::Connect("127.0.0.1:40001", &client);
@@ -97,11 +98,11 @@ struct World {
   std::string name;
   double tick_seconds = 0;
   struct Region {
-    std::string endpoint;
-    Rect rect;  // outer edges are infinite
+    std::string endpoint;  // empty: it has left, and its rectangle is no area
+    Rect rect;             // outer edges are infinite
   };
-  std::vector<Region> regions;
-  uint64_t layout_epoch = 0;
+  std::vector<Region> regions;  // as Body::region counts them; the list only grows
+  uint64_t layout_epoch = 0;    // grows when regions have come or gone, or have other rectangles
 };
 
 // One push; exactly one of an impulse, a change of velocity and a force.
@@ -164,21 +165,23 @@ class Client {
   // Ends all streams. Inputs that were not flushed may or may not act.
   ~Client();
 
-  const World& world() const;
+  // As it is now: regions and the epoch change while the world runs, the rest never does.
+  World world() const;
 
   // Begins to watch, or changes what is in view, with the next frames. INVALID_ARGUMENT (3) for values that cannot be.
   Status Watch(const WatchOptions& options);
-  // Waits until everything in view is known; false after the timeout.
+  // Waits until everything in view is known of all regions that there are then; false after the timeout.
   bool WaitUntilComplete(double timeout_seconds) const;
 
-  // The newest state of every body in view, ascending by id. `tick`: the oldest of the servers' last ticks.
+  // The newest state of every body in view, ascending by id. `tick`: the oldest of the last ticks of the servers that
+  // there are now.
   void Latest(std::vector<Body>* bodies, int64_t* tick = nullptr) const;
   // As Latest, but all at one simulated time: that of the servers now, less `delay_seconds`, interpolated between what
   // was told and extrapolated for at most 0.25 s. With a delay of two frames it is smooth.
   void Sample(std::vector<Body>* bodies, double delay_seconds = 0.07) const;
   // Of a body in view; nothing when it is in view no more.
   std::optional<Look> LookOf(uint64_t body) const;
-  // Simulated time per wall time, as the slowest server tells it.
+  // Simulated time per wall time, as the slowest of the servers that there are now tells it.
   double real_time_factor() const;
   Counts counts() const;
 
@@ -189,7 +192,7 @@ class Client {
   PushCounts pushes() const;
   // `ids`: one per body, 0 for one that was not added.
   Status Spawn(const std::vector<NewBody>& bodies, std::vector<uint64_t>* ids, double timeout_seconds = 10);
-  // In the servers' newest states. UNAVAILABLE (14) when one of them does not answer.
+  // In the servers' newest states. UNAVAILABLE (14) when one of them does not answer in time.
   Status CastRay(const Vec3& origin, const Vec3& direction, double length, RayHit* hit, double timeout_seconds = 2);
   Status Remove(const std::vector<uint64_t>& bodies, int64_t* removed = nullptr, double timeout_seconds = 10);
 

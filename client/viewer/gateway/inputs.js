@@ -20,6 +20,7 @@ export class Inputs {
     this.sequence = 0;
     this.unsettled = new Map();  // by sequence, in order
     this.stream = null;
+    this.serving = '';  // where the stream goes
     this.server = 0;
     this.timer = null;
     this.ended = false;
@@ -49,6 +50,11 @@ export class Inputs {
     return answer;
   }
 
+  // The servers have changed: a stream to one that is none any more is given up, and what it has not settled is repeated.
+  follow() {
+    if (!this.endpoints().includes(this.serving)) this.stream?.cancel();
+  }
+
   close() {
     this.ended = true;
     clearTimeout(this.timer);
@@ -59,7 +65,8 @@ export class Inputs {
     this.timer = null;
     const endpoints = this.endpoints();
     if (endpoints.length === 0) return this.#openLater();
-    const stream = (this.stream = this.rpc.play(endpoints[this.server % endpoints.length]));
+    this.serving = endpoints[this.server % endpoints.length];
+    const stream = (this.stream = this.rpc.play(this.serving));
     stream.on('data', (bytes) => this.#settle(this.rpc.decode('PlayResponse', bytes).outcomes));
     stream.on('error', () => {});
     stream.on('status', (result) => {

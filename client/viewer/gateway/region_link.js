@@ -83,8 +83,8 @@ export class RegionLink {
     const layout = (this.layout = this.rpc.watchLayout(this.endpoint, { auras: this.auras }));
     const auras = this.auras;
     layout.on('data', (bytes) => {
-      // Each replaces the one before, so those that the browser has no room for are left out.
-      if (!this.ended && !this.outlet.full()) this.events.layout(bytes);
+      // Each status replaces the one before, so those that the browser has no room for are left out. Field 1 is the layout.
+      if (!this.ended && (bytes[0] === 0x0a || !this.outlet.full())) this.events.layout(bytes);
     });
     layout.on('error', () => {});
     layout.on('status', (result) => {

@@ -8,12 +8,12 @@ const mostBuffered = 2 << 20;  // bytes on the way to the browser, above which t
 const ask = 1000;              // ms between questions for a world that does not answer
 const framesPerSecond = 20;
 
-export const kinds = { frame: 1, layout: 2, world: 3 };
+export const kinds = { frame: 1, status: 2, world: 3, layout: 4 };
 
 export class Session {
   constructor({ socket, rpc, server }) {
     Object.assign(this, { socket, rpc, server });
-    this.links = [];
+    this.links = [];  // by region; null: it has left
     this.world = null;
     this.auras = false;
     this.ended = false;
@@ -22,7 +22,7 @@ export class Session {
     this.endpointIndex = 0;
     this.inputs = new Inputs({
       rpc,
-      endpoints: () => this.world?.endpoints ?? [],
+      endpoints: () => endpointsOf(this.world),
       settled: (outcome) => this.#tell({ type: 'outcome', ...outcome }),
     });
     socket.on('message', (data, binary) => this.#onMessage(data, binary));
@@ -36,7 +36,7 @@ export class Session {
     this.ended = true;
     clearTimeout(this.askTimer);
     clearInterval(this.roomTimer);
-    for (const link of this.links) link.close();
+    for (const link of this.#open()) link.close();
     this.inputs.close();
     this.socket.terminate();
   }
@@ -47,12 +47,12 @@ export class Session {
     if (this.asking || this.ended) return;
     this.asking = true;
     // All that are known, in turn: one of them may be gone.
-    const known = [this.server, ...(this.world?.endpoints ?? [])];
+    const known = [this.server, ...endpointsOf(this.world)];
     const endpoint = known[this.endpointIndex++ % known.length];
     try {
       let world = await this.#getWorld(endpoint, this.world === null);
       // The scene is large: it is asked for when the world is another one.
-      if (this.world !== null && !sameServers(this.world, world.message)) world = await this.#getWorld(endpoint, true);
+      if (this.world !== null && this.#isOther(world.message)) world = await this.#getWorld(endpoint, true);
       if (!this.ended) this.#takeWorld(world);
     } catch (error) {
       this.#tell({ type: 'waiting', message: textOf(error) });
@@ -68,16 +68,49 @@ export class Session {
 
   #askLater() {
     clearTimeout(this.askTimer);
-    if (this.ended || (this.world !== null && this.links.every((link) => link.up))) return;
+    if (this.ended || (this.world !== null && this.#open().every((link) => link.up))) return;
     this.askTimer = setTimeout(() => this.#askWorld(), ask);
   }
 
+  // Of another name, or begun anew where the one before has ended.
+  #isOther(world) {
+    if (world.name !== this.world.name) return true;
+    return epochOf(world) < epochOf(this.world) && !this.#open().some((link) => link.up);
+  }
+
   #takeWorld({ bytes, message }) {
-    if (this.world !== null && sameServers(this.world, message)) return;
+    if (this.world !== null && !this.#isOther(message)) return this.#takeLayout(bytes, message);
+    for (const link of this.#open()) link.close();
+    this.links = [];
     this.world = message;
     this.#send(kinds.world, 0, bytes);
-    for (const link of this.links) link.close();
-    this.links = message.endpoints.map((endpoint, region) => this.#link(endpoint, region));
+    this.#followLinks();
+    return undefined;
+  }
+
+  // What servers that lag behind tell is older. The links of servers that stay stay.
+  #takeLayout(bytes, world) {
+    const change = epochOf(world) - epochOf(this.world);
+    if (world.name !== this.world.name || change < 0) return;
+    if (change === 0 && world.endpoints.join() === this.world.endpoints.join()) return;
+    this.world = world;
+    this.#send(kinds.layout, 0, bytes);
+    this.#followLinks();
+    this.inputs.follow();
+  }
+
+  #followLinks() {
+    const { endpoints } = this.world;
+    const before = this.links;
+    this.links = endpoints.map((endpoint, region) => {
+      if (endpoint === '') return null;
+      return before[region]?.endpoint === endpoint ? before[region] : this.#link(endpoint, region);
+    });
+    for (const link of before) if (link !== null && !this.links.includes(link)) link.close();
+  }
+
+  #open() {
+    return this.links.filter((link) => link !== null);
   }
 
   #link(endpoint, region) {
@@ -90,9 +123,9 @@ export class Session {
       events: {
         frame: (bytes) => this.#send(kinds.frame, region, bytes),
         layout: (bytes) => {
-          this.#send(kinds.layout, region, bytes);
-          // Field 1: the servers may have changed.
-          if (bytes[0] === 0x0a) this.#noteServers(this.rpc.decode('LayoutUpdate', bytes).world);
+          this.#send(kinds.status, region, bytes);
+          // Field 1: the layout may have changed.
+          if (bytes[0] === 0x0a) this.#takeLayout(firstField(bytes), this.rpc.decode('LayoutUpdate', bytes).world);
         },
         up: () => this.#tell({ type: 'link', region, up: true }),
         down: (message) => {
@@ -101,10 +134,6 @@ export class Session {
         },
       },
     });
-  }
-
-  #noteServers(world) {
-    if (world && !sameServers(this.world, world)) this.#askWorld();
   }
 
   // ---- to the browser ----
@@ -166,7 +195,7 @@ export class Session {
     if (message.type === 'restart') return this.links.at(Number.isInteger(message.region) ? message.region : 0)?.restart();
     if (message.type === 'auras') {
       this.auras = message.on === true;
-      for (const link of this.links) link.setAuras(this.auras);
+      for (const link of this.#open()) link.setAuras(this.auras);
       return undefined;
     }
     throw new BadRequest('type: no such message');
@@ -190,7 +219,7 @@ export class Session {
 
   // Bodies may be on other servers than their place says, so all are asked.
   async #castRay(request) {
-    const endpoints = this.world?.endpoints ?? [];
+    const endpoints = endpointsOf(this.world);
     const answers = await Promise.all(endpoints.map((endpoint) => this.rpc.call(endpoint, 'CastRays', request, 2)));
     let nearest = null;
     for (const bytes of answers) {
@@ -209,6 +238,17 @@ export class Session {
   }
 }
 
-function sameServers(a, b) {
-  return a.name === b.name && a.layout_epoch === b.layout_epoch && a.endpoints.join() === b.endpoints.join();
+const epochOf = (world) => Number(world.layout_epoch);
+
+// Of the regions that have not left.
+const endpointsOf = (world) => (world?.endpoints ?? []).filter((endpoint) => endpoint !== '');
+
+// The bytes of the message that is field 1.
+function firstField(bytes) {
+  let length = 0, at = 1;
+  for (let scale = 1; ; scale *= 128) {
+    const byte = bytes[at++];
+    length += (byte & 127) * scale;
+    if (byte < 128) return bytes.subarray(at, at + length);
+  }
 }

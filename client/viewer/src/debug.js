@@ -13,7 +13,8 @@ export function exposeDebug({ state, view, model, seek, spawn, select }) {
   };
   window.aureole = {
     ready: () => model.complete && view.framed,
-    counts: () => ({ ...model.counts(), drawn: view.bodyView.views.size, regions: model.regions }),
+    counts: () => ({ ...model.counts(), drawn: view.bodyView.views.size, regions: model.members.length }),
+    members: () => model.members,
     tick: () => view.tick,
     newest: () => model.newest,
     ids: () => [...model.bodies.keys()].map(String),

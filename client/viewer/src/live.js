@@ -1,10 +1,10 @@
 // The connection to the gateway.
 
-const kinds = { frame: 1, layout: 2, world: 3 };
+const kinds = { frame: 1, status: 2, world: 3, layout: 4 };
 const retryMs = 1000;
 
 export class Live {
-  // `on`: world(message), begin(region), frame(region, message, bytes), status(region, message), link(region, up, text),
+  // `on`: world(message), layout(message, regions whose streams have ended), begin(region), frame(region, message, bytes), status(region, message), link(region, up, text),
   // connection(up, text) to the gateway, waiting(text) for a world, outcome(message), error(text).
   constructor(messages, on) {
     this.messages = messages;
@@ -14,6 +14,7 @@ export class Live {
     this.calls = new Map();  // by number
     this.lastCall = 0;
     this.begun = new Set();  // regions whose stream is being read
+    this.endpoints = [];     // of the layout, by region
     this.auras = false;
     this.#open();
   }
@@ -101,13 +102,25 @@ export class Live {
     const region = bytes[2] | (bytes[3] << 8);
     const body = bytes.subarray(4);
     if (bytes[0] === kinds.world) {
+      const world = this.messages.decode('GetWorldResponse', body);
       this.begun.clear();
-      this.on.world(this.messages.decode('GetWorldResponse', body));
+      this.endpoints = world.endpoints;
+      this.on.world(world);
       this.on.connection(true, '');
     } else if (bytes[0] === kinds.layout) {
+      this.#takeLayout(this.messages.decode('GetWorldResponse', body));
+    } else if (bytes[0] === kinds.status) {
       const { status } = this.messages.decode('LayoutUpdate', body);
       if (status !== null) this.on.status(region, status);
     } else if (bytes[0] === kinds.frame && this.begun.has(region)) this.#takeFrame(region, body);
+  }
+
+  // Frames of servers that are elsewhere, or nowhere, come no more.
+  #takeLayout(world) {
+    const ended = [...this.endpoints.keys()].filter((region) => world.endpoints[region] !== this.endpoints[region]);
+    for (const region of ended) this.begun.delete(region);
+    this.endpoints = world.endpoints;
+    this.on.layout(world, ended);
   }
 
   #takeFrame(region, body) {

@@ -51,7 +51,7 @@ function connectionText() {
   if (!state.connected) return `connection lost, trying again: ${state.reason}`;
   if (state.downs.size === 0) return '';
   const [region, reason] = [...state.downs][0];
-  const which = state.downs.size === model.regions ? 'all regions' : `region ${[...state.downs.keys()].sort().join(', ')}`;
+  const which = state.downs.size === model.members.length ? 'all regions' : `region ${[...state.downs.keys()].sort().join(', ')}`;
   return `connection lost to ${which}, trying again: ${reason || `region ${region} is gone`}`;
 }
 
@@ -74,30 +74,39 @@ const liveEvents = {
     view.setWorld();
     clearCharts();
   },
+  layout(world, ended) {
+    for (const region of ended) {
+      state.downs.delete(region);
+      view.overlays.setAuras(region, []);
+    }
+    model.setLayout(world);
+    view.setLayout();
+  },
   begin(region) {
     state.downs.delete(region);
     model.beginStream(region);
   },
   frame(region, frame, bytes) {
-    // The run was started anew: nothing of the old one counts.
-    if (frame.base_tick === 0 && frame.tick < model.stream(region).tick) {
+    // The run was started anew: nothing of the old one counts. A server that was replaced goes back alone.
+    const others = model.streams.some((stream, other) => other !== region && stream.up);
+    if (frame.base_tick === 0 && frame.tick < model.stream(region).tick && !others) {
       model.setWorld(model.world);
       view.setWorld();
-      for (const other of model.streams.keys()) model.beginStream(other);
+      for (const other of model.members) model.beginStream(other);
     }
     model.takeFrame(region, frame, bytes);
     view.clock.take(frame.tick, performance.now());
   },
   status: takeStatus,
   link(region, up, text) {
-    if (up) return;
+    if (up || !model.members.includes(region)) return;
     state.downs.set(region, text);
     model.stream(region).up = false;
   },
   connection(up, text) {
     state.connected = up;
     state.reason = text;
-    if (!up) for (const stream of model.streams) stream.up = false;
+    if (!up) model.streams.forEach((stream) => (stream.up = false));
   },
   // A world that is known stays; its regions say themselves that they are gone.
   waiting: (text) => (state.reason = text),
@@ -413,7 +422,10 @@ function showText(now) {
 function showRegionCounts() {
   const owned = new Array(model.regions).fill(0);
   for (const body of model.bodies.values()) ++owned[body.region];
-  showRegions(owned.map((bodies, region) => ({ bodies, up: view.player !== null || model.stream(region).up })));
+  const { members } = model;
+  showRegions(owned.map((bodies, region) => ({
+    bodies, there: members.includes(region), up: view.player !== null || model.streams[region]?.up === true,
+  })));
 }
 
 function drawCharts(now) {

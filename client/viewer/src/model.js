@@ -36,6 +36,7 @@ export class Model {
     this.streams = [];
     this.newest = 0;  // tick
     this.period = 0;  // ticks between frames, as of late
+    if (this.world !== null) this.merger.follow(Number(this.world.layout_epoch), this.members);
     this.listener.reset();
   }
 
@@ -46,17 +47,31 @@ export class Model {
     return (this.world?.tick_us || 16000) * 1e-6;
   }
   get complete() {
-    return this.regions > 0 && this.streams.length === this.regions && this.streams.every((s) => s?.complete);
+    return this.members.length > 0 && this.members.every((region) => this.streams[region]?.complete);
   }
   get regions() {
     return this.world?.layout.length ?? 0;
+  }
+  // The regions that have not left.
+  get members() {
+    const endpoints = this.world?.endpoints ?? [];
+    return [...endpoints.keys()].filter((region) => endpoints[region] !== '');
   }
 
   // null: none.
   setWorld(world) {
     this.world = world;
     this.clear();
-    for (let region = 0; region < this.regions; ++region) this.stream(region);
+    for (const region of this.members) this.stream(region);
+  }
+
+  // Of the same world, without its scene: servers have come or gone, or are elsewhere.
+  setLayout(world) {
+    this.world = { ...world, scene: this.world.scene };
+    const { members } = this;
+    for (const region of this.streams.keys()) if (!members.includes(region)) delete this.streams[region];
+    for (const region of members) this.stream(region);
+    this.merger.follow(Number(world.layout_epoch), members);
   }
 
   stream(region) {
@@ -76,13 +91,9 @@ export class Model {
     const stream = this.stream(region);
     stream.decoder.apply(frame);
     for (const d of frame.described) this.#describe(d);
-    this.merger.apply(region, stream.decoder, frame.more);
+    this.merger.apply(region, stream.decoder, frame);
     this.#tellListener();
-    if (!stream.complete && !frame.more) {
-      stream.complete = true;
-      this.merger.reconcile(region, stream.decoder);
-      this.#tellListener();
-    }
+    stream.complete ||= !frame.more;
     stream.tick = frame.tick;
     stream.realTimeFactor = frame.real_time_factor;
     ++stream.frames;

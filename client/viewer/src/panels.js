@@ -46,7 +46,7 @@ export function showBody(view) {
   });
 }
 
-// A square and a number per region; those that are not connected are crossed out.
+// A square and a number per region that is there; those that are not connected are crossed out.
 export function showRegions(regions) {
   const list = byId('regions');
   while (list.children.length > regions.length) list.lastChild.remove();
@@ -57,8 +57,9 @@ export function showRegions(regions) {
     item.append(square, document.createElement('span'));
     list.append(item);
   }
-  regions.forEach(({ bodies, up }, region) => {
+  regions.forEach(({ bodies, there, up }, region) => {
     const item = list.children[region];
+    item.hidden = !there;
     item.className = up ? '' : 'lost';
     item.title = up ? `region ${region}: ${bodies} bodies` : `region ${region}: not connected`;
     setText(item.lastChild, `${region}: ${bodies}`);

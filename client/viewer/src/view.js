@@ -81,6 +81,11 @@ export class View {
     this.select(null);
   }
 
+  // Regions have come or gone, or have other borders.
+  setLayout() {
+    if (this.framed) this.#layOut(this.#middle());
+  }
+
   select(id) {
     this.bodyView.select(id);
     this.stale = true;

@@ -54,12 +54,13 @@ export async function stop(child, seconds = 5) {
   kill(child);
 }
 
-// Runs a world. The servers: ["host:port", ...].
+// Runs a world. The servers: ["host:port", ...]; its control plane: "host:port".
 export async function startWorld(bin, worldFile) {
   // It ends by itself even when nobody is left to end it.
   const args = ['up', worldFile, '--duration', '3m', '--hash-every', '0'];
-  const { child, match } = await startUntil(path.join(bin, 'aureole'), args, /servers:\s*((?:[\w.[\]:-]+:\d+[, ]*)+)\n/);
-  return { child, servers: match[1].split(/[,\s]+/).filter((s) => s !== '') };
+  const ready = /servers:\s*((?:[\w.[\]:-]+:\d+[, ]*)+)\ncontrol plane (\S+)\n/;
+  const { child, match } = await startUntil(path.join(bin, 'aureole'), args, ready);
+  return { child, servers: match[1].split(/[,\s]+/).filter((s) => s !== ''), control: match[2] };
 }
 
 export function findChromium() {

@@ -143,10 +143,12 @@ describe('the decoder', () => {
 // Two regions that hand over body 7: region 0 has it with epoch 0, region 1 with epoch 1 from tick 12 on.
 function handOver() {
   const merger = new ReplicaMerger();
+  merger.follow(0, [0, 1]);
   const streams = [new ReplicaDecoder(), new ReplicaDecoder()];
   const take = (region, frame) => {
+    if (frame.base_tick === 0) streams[region] = new ReplicaDecoder();
     streams[region].apply(frame);
-    merger.apply(region, streams[region]);
+    merger.apply(region, streams[region], frame);
   };
   take(0, frameOf(10, 0, [cellOf(0, 0, [{ id: 7, epoch: 0, at: [1, 0, 0] }])]));
   take(1, frameOf(10, 0, []));
@@ -203,14 +205,47 @@ describe('the merger', () => {
     world.take(0, frameOf(11, 10, [{ x: 0, z: 0, id: [7], position: [9999, 0, 0], orientation: [0, 0, 0] }]));
     assert.equal(world.merger.bodies.size, 0);
   });
-  test('WhatANewStreamDoesNotTellIsGone', () => {
+  test('WhatANewStreamDoesNotTellIsGoneWhenNobodyElseTellsIt', () => {
     const world = handOver();
-    const fresh = new ReplicaDecoder();
-    fresh.apply(frameOf(20, 0, []));
-    world.merger.apply(0, fresh);
-    assert.equal(world.merger.bodies.size, 1);
-    world.merger.reconcile(0, fresh);
+    world.take(0, frameOf(20, 0, []));
+    assert.equal(world.merger.bodies.size, 1, 'region 1 may have it by tick 20');
+    world.take(1, frameOf(20, 10, []));
     assert.equal(world.merger.bodies.size, 0);
+  });
+  test('BodiesOfARegionThatLeavesStayUntilAnotherTellsThem', () => {
+    const world = handOver();
+    world.merger.follow(1, [1, 2]);
+    const of = { layout_epoch: 1 };
+    world.take(1, frameOf(12, 10, []));
+    world.take(2, frameOf(12, 0, []));
+    world.take(1, frameOf(14, 12, [], of));
+    assert.equal(world.merger.bodies.size, 1, 'region 2 has told nothing of this layout');
+    world.take(2, frameOf(13, 12, [], of));
+    assert.equal(world.merger.bodies.size, 1, 'nor what it has at tick 14');
+    world.take(2, frameOf(14, 13, [cellOf(0, 0, [{ id: 7, epoch: 1, at: [2, 0, 0] }])], of));
+    assert.equal(world.regionOf(), 2);
+    world.take(1, frameOf(20, 14, [], of));
+    world.take(2, frameOf(20, 14, [], of));
+    assert.equal(world.merger.bodies.size, 1);
+  });
+  test('ABodyOfARegionThatHasLeftWhichNobodyHasIsGone', () => {
+    const world = handOver();
+    world.merger.follow(1, [1]);
+    world.take(1, frameOf(12, 10, []));
+    assert.equal(world.merger.bodies.size, 1);
+    world.take(1, frameOf(14, 12, [], { layout_epoch: 1 }));
+    assert.equal(world.merger.bodies.size, 0);
+    assert.deepEqual(world.merger.lost.map((b) => b.id), [7n]);
+  });
+  test('ABodyThatWentOnBeforeItsNewOwnersStreamBeganStaysUntilAThirdTellsIt', () => {
+    const world = handOver();
+    world.merger.follow(0, [0, 1, 2]);
+    world.leaves();
+    world.take(1, frameOf(14, 0, []));  // begun anew: it gave the body to region 2 at tick 13
+    world.take(0, frameOf(14, 12, []));
+    assert.equal(world.merger.bodies.size, 1);
+    world.take(2, frameOf(14, 0, [cellOf(0, 0, [{ id: 7, epoch: 2, at: [2, 0, 0] }])]));
+    assert.equal(world.regionOf(), 2);
   });
   test('ABodyAtRestIsShownAtRestUntilItWasToldToMove', () => {
     const world = handOver();

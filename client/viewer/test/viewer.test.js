@@ -1,10 +1,12 @@
 // The viewer as people use it: a running world, the gateway, and a browser that draws in software.
 import assert from 'node:assert/strict';
+import { execFile } from 'node:child_process';
 import fs from 'node:fs';
 import os from 'node:os';
 import path from 'node:path';
 import { after, before, describe, test } from 'node:test';
 import { fileURLToPath } from 'node:url';
+import { promisify } from 'node:util';
 import { McapIndexedReader } from '@mcap/core';
 import { chromium } from 'playwright-core';
 import protobuf from 'protobufjs';
@@ -235,6 +237,36 @@ describe('a recording', { concurrency: false }, () => {
     });
     assert.ok(movedBy.filter((d) => d > 0.05).length > 100, 'hardly anything moves');
     assert.deepEqual(await shownAtStart(), first);
+  });
+});
+
+describe('servers that come and go', () => {
+  test('ThePageFollowsThemAndMissesNoBody', async () => {
+    await page.goto(url);
+    await until('the world', () => window.aureole?.ready());
+    const { bodies } = await ask(() => window.aureole.counts());
+    await ask(() => {
+      window.seen = [];
+      setInterval(() => window.seen.push(window.aureole.counts().bodies), 20);
+    });
+    for (const [columns, rows] of [[3, 2], [2, 1]]) {
+      const args = ['resize', '--control', world.control, '--columns', columns, '--rows', rows].map(String);
+      await promisify(execFile)(path.join(bin, 'aureole'), args);
+      await until(`${columns} times ${rows} regions`, ([regions]) => {
+        const owners = new Set(window.aureole.ids().map((id) => window.aureole.body(id)?.region));
+        const members = window.aureole.members();
+        return members.length === regions && window.aureole.ready() && window.aureole.connected()
+          && owners.size === regions && members.every((region) => owners.has(region));
+      }, columns * rows);
+      assert.equal(await ask(() => [...document.querySelectorAll('#regions li')].filter((item) => !item.hidden).length),
+        columns * rows);
+      await takePicture(`regions-${columns * rows}`);
+    }
+    const seen = await ask(() => window.seen);
+    assert.ok(seen.length > 20);
+    assert.deepEqual([Math.min(...seen), Math.max(...seen)], [bodies, bodies]);
+    // Inputs go to a server that is there.
+    await addBall([0, 30, 0]);
   });
 });
 
