@@ -64,9 +64,13 @@ void RegionWatch::Run() {
     if (stream->Write(first)) Read(stream.get(), first.watch());
     context->TryCancel();
     const grpc::Status status = stream->Finish();
+    {
+      const std::lock_guard lock(mutex_);
+      context_ = nullptr;
+      if (ended_) return;
+    }
     events_.connection(false);
     std::unique_lock lock(mutex_);
-    context_ = nullptr;
     backoff = status.error_code() == grpc::StatusCode::UNAVAILABLE ? std::min(2 * backoff, kMaxBackoff) : kMinBackoff;
     ended_changed_.wait_for(lock, backoff, [this] { return ended_; });
   }

@@ -202,7 +202,7 @@ class Player {
       return std::all_of(bodies.begin(), bodies.end(),
                          [&](const Body& b) { return b.velocity.y == expected_[b.id - 1]; });
     };
-    for (const auto end = std::chrono::steady_clock::now() + 5s; !right() && std::chrono::steady_clock::now() < end;) {
+    for (const auto end = std::chrono::steady_clock::now() + 15s; !right() && std::chrono::steady_clock::now() < end;) {
       std::this_thread::sleep_for(5ms);
     }
     for (const Body& b : bodies) EXPECT_EQ(b.velocity.y, expected_[b.id - 1]) << b.id;
@@ -214,7 +214,7 @@ class Player {
   // These servers, and no others.
   void ExpectServers(const std::set<std::string>& endpoints) {
     std::set<std::string> known;
-    for (const auto end = std::chrono::steady_clock::now() + 5s;
+    for (const auto end = std::chrono::steady_clock::now() + 15s;
          known != endpoints && std::chrono::steady_clock::now() < end;) {
       known.clear();
       for (const auto& r : client_->world().regions) {
@@ -223,7 +223,7 @@ class Player {
       std::this_thread::sleep_for(5ms);
     }
     EXPECT_EQ(known, endpoints);
-    EXPECT_TRUE(client_->WaitUntilComplete(5));
+    EXPECT_TRUE(client_->WaitUntilComplete(15));
     EXPECT_GT(client_->real_time_factor(), 0.1) << "of servers that are there";
   }
 

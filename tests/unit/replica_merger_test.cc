@@ -115,7 +115,7 @@ TEST(ReplicaMerger, BodiesOfARegionThatLeavesStayUntilOthersTellThem) {
   s.Take(2, "tick: 3", 1);
   EXPECT_TRUE(s.Shows(7)) << "these are frames of the layout before";
   s.Take(0, "tick: 9");
-  s.Take(2, "tick: 8 more: true");
+  s.Take(2, "tick: 7 more: true");
   EXPECT_TRUE(s.Shows(7)) << "region 2 has not told all";
   s.Take(2, NewBody(8, 1));
   EXPECT_EQ(s.RegionOf(7), 2);
