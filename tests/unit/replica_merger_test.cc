@@ -150,6 +150,14 @@ TEST(ReplicaMerger, BodyThatIsHandedToARegionThatLeavesGoesOnFromThere) {
   EXPECT_TRUE(s.Shows(7));
   s.Take(2, NewBody(9, 2));
   EXPECT_EQ(s.RegionOf(7), 2);
+  Streams gone;
+  gone.Follow(2, {0, 1, 2});
+  gone.Take(0, NewBody(1, 0));
+  gone.Take(0, "tick: 3 cells { gone: 7 why: 3 moved_epoch: 1 moved_tick: 0 }");
+  gone.Follow(3, {0, 2});
+  gone.Take(0, "tick: 9");
+  gone.Take(2, "tick: 9");
+  EXPECT_FALSE(gone.Shows(7)) << "removed before region 1 left";
   // And when it is heard of after the region has left.
   Streams late;
   late.Take(0, NewBody(1, 0));
