@@ -239,7 +239,7 @@ int Up(const UpOptions& options) {
   RunResult result;
   const absl::Status status = RunWorld(
       run, allocator, [&display](const RunStatus& now) { return display.Show(now) && Interrupts() == 0; }, &result,
-      [](const RunEvent& event) { std::cerr << "aureole: region " << event.region << ": " << event.what << '\n'; });
+      [](const RunEvent& event) { std::cerr << "aureole: " << TextOf(event) << '\n'; });
 
   if (options.json) {
     std::cout << ResultJson(heading, options, status, result).dump(2) << std::endl;

@@ -27,7 +27,7 @@ uint64_t NextSequence(uint64_t last) {
 
 }  // namespace
 
-LayoutRun::LayoutRun(LayoutDesk* desk, int regions, std::function<void(RegionId, const std::string&)> tell)
+LayoutRun::LayoutRun(LayoutDesk* desk, int regions, Tell tell)
     : desk_(desk), tell_(std::move(tell)), regions_(regions) {
   if (desk_ != nullptr) now_ = desk_->state().now;
 }
@@ -141,12 +141,14 @@ void LayoutRun::Propose(const LayoutChange& change) {
   sequence_ = NextSequence(sequence_);
   offer_.reset();
   outcome_.reset();
+  tell_(v1::ControlEvent::LAYOUT_PROPOSED, kNoRegion,
+        absl::StrCat("a layout of epoch ", change.epoch, " is proposed, of ", change.members.size(), " regions"));
   for (RegionId r : change.members) {
     if (Contains(now_.members, r)) continue;
     regions_ = std::max(regions_, r + 1);
     EncodeLayoutChange(change, &(joins_[r] = {}));
     service_->Admit(r, change);
-    tell_(r, absl::StrCat("joins with the layout of epoch ", change.epoch));
+    tell_(v1::ControlEvent::REGION_JOINS, r, absl::StrCat("joins with the layout of epoch ", change.epoch));
   }
 }
 
@@ -154,18 +156,19 @@ void LayoutRun::Adopt() {
   for (RegionId r : now_.members) {
     if (Contains(proposed_->members, r)) continue;
     leaving_.insert(r);
-    tell_(r, absl::StrCat("leaves with the layout of epoch ", proposed_->epoch));
+    tell_(v1::ControlEvent::REGION_LEAVES, r, absl::StrCat("leaves with the layout of epoch ", proposed_->epoch));
   }
   now_ = *std::exchange(proposed_, std::nullopt);
   refused_.clear();
   service_->SetLayout(now_);
-  tell_(kNoRegion,
+  tell_(v1::ControlEvent::LAYOUT_IN_FORCE, kNoRegion,
         absl::StrCat("the layout of epoch ", now_.epoch, " is in force, of ", now_.members.size(), " regions"));
 }
 
 void LayoutRun::Drop() {
   if (refused_ != outcome_->refused()) {
-    tell_(kNoRegion, absl::StrCat("the layout of epoch ", proposed_->epoch, " was refused: ", outcome_->refused()));
+    tell_(v1::ControlEvent::LAYOUT_REFUSED, kNoRegion,
+          absl::StrCat("the layout of epoch ", proposed_->epoch, " was refused: ", outcome_->refused()));
   }
   refused_ = outcome_->refused();
   for (RegionId r : proposed_->members) {
@@ -179,7 +182,7 @@ void LayoutRun::Drop() {
 void LayoutRun::Ended(RegionId region, bool clean) {
   if (ending_.erase(region) == 0 && (!clean || leaving_.erase(region) == 0)) return;
   service_->Retire(region);
-  tell_(region, "has left");
+  tell_(v1::ControlEvent::REGION_LEFT, region, "has left");
 }
 
 void LayoutRun::Publish() const {

@@ -15,6 +15,7 @@
 #include "server/control/control_service.h"
 #include "server/control/layout_change.h"
 #include "server/control/layout_desk.h"
+#include "server/control/run_event.h"
 #include "server/control/run_status.h"
 
 namespace aureole {
@@ -23,7 +24,8 @@ namespace aureole {
 class LayoutRun {
  public:
   // All outlive it. `desk`: null: the layout stays as it is. `tell`: what happens, for people.
-  LayoutRun(LayoutDesk* desk, int regions, std::function<void(RegionId, const std::string&)> tell);
+  using Tell = std::function<void(EventKind, RegionId, const std::string&)>;
+  LayoutRun(LayoutDesk* desk, int regions, Tell tell);
 
   // What an earlier control plane has kept, before anything else. FailedPrecondition: it is no layout.
   absl::Status Restore(const v1::WorldRecord& record);
@@ -63,7 +65,7 @@ class LayoutRun {
 
   ControlService* service_ = nullptr;
   LayoutDesk* const desk_;
-  const std::function<void(RegionId, const std::string&)> tell_;
+  const Tell tell_;
   int regions_;
   LayoutChange now_;
   std::optional<LayoutChange> proposed_;

@@ -133,7 +133,7 @@ int main(int argc, char** argv) {
       },
       &result,
       [&store](const aureole::RunEvent& event) {
-        std::cerr << "[control] region " << event.region << ": " << event.what << '\n';
+        std::cerr << "[control] " << aureole::TextOf(event) << '\n';
         if (store == nullptr) return;
         if (absl::Status s = store->Append(event); !s.ok()) std::cerr << "[control] " << s.message() << '\n';
       });

@@ -105,8 +105,9 @@ class Runner {
     plan_regions_.resize(servers_.size());
     const auto now = Clock::now();
     for (Server& server : servers_) server.ended = now;
-    layout_ = std::make_unique<LayoutRun>(options_.layouts, regions,
-                                          [this](RegionId r, const std::string& what) { Tell(r, what); });
+    layout_ = std::make_unique<LayoutRun>(
+        options_.layouts, regions,
+        [this](EventKind kind, RegionId r, const std::string& what) { Tell(kind, r, what); });
     record_.set_world_hash(WorldHash(options_.world));
     for (int i = 0; i < regions; ++i) record_.add_regions();
     if (options_.store == nullptr) return absl::OkStatus();
@@ -313,7 +314,8 @@ class Runner {
     }
     for (const Action& a : actions) {
       if (a.kind == Action::Kind::kEnd) {
-        Tell(a.region, absl::StrCat("incarnation ", a.incarnation, " is ended: ", a.why));
+        Tell(v1::ControlEvent::REGION_ENDED, a.region,
+             absl::StrCat("incarnation ", a.incarnation, " is ended: ", a.why));
         allocator_.End(a.region, a.incarnation);
       } else if (absl::Status s = Start(a); !s.ok()) {
         return s;
@@ -333,7 +335,8 @@ class Runner {
     if (a.incarnation > 1) {
       // Clients look for it there, unless another program has taken the port.
       if (!server.port_lost) listen = service_->Status().regions[static_cast<size_t>(a.region)].endpoint;
-      Tell(a.region, absl::StrCat("incarnation ", a.incarnation, " is started: ", a.why));
+      Tell(server.joins ? v1::ControlEvent::REGION_STARTED : v1::ControlEvent::REGION_REPLACED, a.region,
+           absl::StrCat("incarnation ", a.incarnation, " is started: ", a.why));
     }
     if (absl::Status s = allocator_.Start({a.region, a.incarnation, token, address_, listen}); !s.ok()) return s;
     server.incarnation = a.incarnation;
@@ -382,23 +385,29 @@ class Runner {
     for (size_t i = 0; i < servers_.size(); ++i) {
       const auto region = static_cast<RegionId>(i);
       const RegionStatus& r = status.regions[i];
-      TellOfFailure(region, "checkpoints", r.report.storage_failure(), &servers_[i].storage_failure);
-      TellOfFailure(region, "a copy", r.report.copy_failure(), &servers_[i].copy_failure);
-      if (r.fetched != servers_[i].fetched && !r.fetched.empty()) Tell(region, "goes on from " + r.fetched);
+      TellOfFailure(region, "checkpoints", r.report.storage_failure(), &servers_[i].storage_failure,
+                    v1::ControlEvent::STORAGE_FAILED, v1::ControlEvent::STORAGE_RECOVERED);
+      TellOfFailure(region, "a copy", r.report.copy_failure(), &servers_[i].copy_failure, v1::ControlEvent::COPY_LOST,
+                    v1::ControlEvent::COPY_RECOVERED);
+      if (r.fetched != servers_[i].fetched && !r.fetched.empty()) {
+        Tell(v1::ControlEvent::COPY_FETCHED, region, "goes on from " + r.fetched);
+      }
       servers_[i].fetched = r.fetched;
     }
   }
 
-  void TellOfFailure(RegionId region, const char* by, const std::string& failure, std::string* told) const {
+  void TellOfFailure(RegionId region, const char* by, const std::string& failure, std::string* told, EventKind failed,
+                     EventKind recovered) const {
     if (failure.empty() != told->empty()) {
-      Tell(region, failure.empty() ? absl::StrCat("is protected by ", by, " again")
-                                   : absl::StrCat("is not protected by ", by, ": ", failure));
+      Tell(failure.empty() ? recovered : failed, region,
+           failure.empty() ? absl::StrCat("is protected by ", by, " again")
+                           : absl::StrCat("is not protected by ", by, ": ", failure));
     }
     *told = failure;
   }
 
-  void Tell(RegionId region, const std::string& what) const {
-    if (on_event_) on_event_({std::chrono::system_clock::now(), region, what});
+  void Tell(EventKind kind, RegionId region, const std::string& what) const {
+    if (on_event_) on_event_({std::chrono::system_clock::now(), kind, region, what});
   }
 
   absl::Status StopAll(const std::string& reason) {

@@ -14,6 +14,7 @@
 #include "server/control/control_hub.h"
 #include "server/control/control_service.h"
 #include "server/control/layout_desk.h"
+#include "server/control/run_event.h"
 #include "server/control/run_status.h"
 #include "server/control/world_store.h"
 #include "server/transport/security.h"

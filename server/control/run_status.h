@@ -50,13 +50,6 @@ struct TickSum {
   bool complete() const { return regions > 0 && regions == members; }
 };
 
-// Something that the control plane has decided, or has seen happen.
-struct RunEvent {
-  std::chrono::system_clock::time_point time;
-  RegionId region = kNoRegion;  // kNoRegion: the world
-  std::string what;
-};
-
 struct RunStatus {
   Stage stage = Stage::kJoining;
   std::string control;                // where servers and operators reach the control plane, host:port

@@ -91,11 +91,18 @@ absl::Status SqliteStore::Prepare() {
                                "CREATE TABLE IF NOT EXISTS control(id INTEGER PRIMARY KEY CHECK(id = 1),"
                                "  epoch INTEGER NOT NULL, record BLOB);"
                                "CREATE TABLE IF NOT EXISTS events(id INTEGER PRIMARY KEY,"
-                               "  time_us INTEGER NOT NULL, region INTEGER NOT NULL, what TEXT NOT NULL);"
+                               "  time_us INTEGER NOT NULL, region INTEGER NOT NULL, what TEXT NOT NULL,"
+                               "  kind INTEGER NOT NULL DEFAULT 0);"
                                "INSERT OR IGNORE INTO control VALUES (1, 0, NULL);"
                                "UPDATE control SET epoch = epoch + 1; COMMIT;");
       !s.ok()) {
     return s;
+  }
+  Statement kind(db_, "SELECT 1 FROM pragma_table_info('events') WHERE name = 'kind'");
+  const absl::StatusOr<bool> kinds = kind.Step();
+  if (!kinds.ok()) return kinds.status();
+  if (!*kinds) {  // a file from before events had one
+    if (absl::Status s = Execute("ALTER TABLE events ADD COLUMN kind INTEGER NOT NULL DEFAULT 0"); !s.ok()) return s;
   }
   Statement epoch(db_, "SELECT epoch FROM control");
   const absl::StatusOr<bool> row = epoch.Step();
@@ -123,10 +130,11 @@ absl::Status SqliteStore::Save(const v1::WorldRecord& record) {
 
 absl::Status SqliteStore::Append(const RunEvent& event) {
   const auto since = event.time.time_since_epoch();
-  Statement insert(db_, "INSERT INTO events(time_us, region, what) VALUES (?, ?, ?)");
+  Statement insert(db_, "INSERT INTO events(time_us, region, what, kind) VALUES (?, ?, ?, ?)");
   insert.Bind(1, std::chrono::duration_cast<std::chrono::microseconds>(since).count());
   insert.Bind(2, event.region);
   insert.Bind(3, event.what);
+  insert.Bind(4, event.kind);
   if (absl::Status s = insert.Step().status(); !s.ok()) return s;
   Statement trim(db_, "DELETE FROM events WHERE id <= (SELECT MAX(id) FROM events) - ?");
   trim.Bind(1, kMostEvents);
@@ -134,15 +142,17 @@ absl::Status SqliteStore::Append(const RunEvent& event) {
 }
 
 absl::StatusOr<std::vector<RunEvent>> SqliteStore::Events(int most) {
-  Statement select(db_, "SELECT time_us, region, what FROM events ORDER BY id DESC LIMIT ?");
+  Statement select(db_, "SELECT time_us, kind, region, what FROM events ORDER BY id DESC LIMIT ?");
   select.Bind(1, most);
   std::vector<RunEvent> out;
   for (;;) {
     const absl::StatusOr<bool> row = select.Step();
     if (!row.ok()) return row.status();
     if (!*row) break;
+    const auto kind = static_cast<int>(select.Integer(1));
     out.push_back({std::chrono::system_clock::time_point(std::chrono::microseconds(select.Integer(0))),
-                   static_cast<RegionId>(select.Integer(1)), select.Bytes(2)});
+                   v1::ControlEvent::Kind_IsValid(kind) ? static_cast<EventKind>(kind) : v1::ControlEvent::UNKNOWN,
+                   static_cast<RegionId>(select.Integer(2)), select.Bytes(3)});
   }
   std::reverse(out.begin(), out.end());
   return out;

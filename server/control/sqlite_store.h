@@ -5,7 +5,7 @@
 #include <memory>
 #include <vector>
 
-#include "server/control/run_status.h"
+#include "server/control/run_event.h"
 #include "server/control/world_store.h"
 
 struct sqlite3;

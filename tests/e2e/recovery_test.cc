@@ -64,7 +64,7 @@ class Recovery : public testing::Test {
   absl::Status Run(const RunOptions& options, const RunObserver& observe) {
     LocalAllocator allocator({"", directory_ / "logs", false, directory_ / "data"});
     const absl::Status s = RunWorld(options, allocator, observe, &result_, [this](const RunEvent& e) {
-      events_ += "region " + std::to_string(e.region) + ": " + e.what + "\n";
+      events_ += NameOf(e.kind) + ", region " + std::to_string(e.region) + ": " + e.what + "\n";
     });
     EXPECT_EQ(allocator.running(), 0);
     return s;
@@ -204,7 +204,7 @@ TEST_F(Recovery, LostVolumesChangeNoBit) {
   });
   ASSERT_TRUE(s.ok()) << s;
   EXPECT_GE(destroyer.destroyed(), 3) << events_;
-  EXPECT_TRUE(Happened("region 0: goes on from the copy at region 1, of tick ")) << events_;
+  EXPECT_TRUE(Happened("CopyFetched, region 0: goes on from the copy at region 1, of tick ")) << events_;
   ExpectExact(options);
 }
 
@@ -276,8 +276,9 @@ TEST_F(Recovery, FrozenServerIsReplacedAfterItsLease) {
     return true;
   });
   ASSERT_TRUE(s.ok()) << s;
-  EXPECT_NE(events_.find("region 1: incarnation 1 is ended: nothing heard of it for"), std::string::npos) << events_;
-  EXPECT_NE(events_.find("region 1: incarnation 2 is started"), std::string::npos) << events_;
+  EXPECT_NE(events_.find("RegionEnded, region 1: incarnation 1 is ended: nothing heard of it for"), std::string::npos)
+      << events_;
+  EXPECT_NE(events_.find("RegionReplaced, region 1: incarnation 2 is started"), std::string::npos) << events_;
   ExpectExact(options);
 }
 
@@ -367,8 +368,8 @@ TEST_F(Recovery, RegionWithoutACopyGoesOnAndSaysSo) {
     return true;
   });
   ASSERT_TRUE(s.ok()) << s;
-  EXPECT_TRUE(Happened("region 1: is not protected by a copy: its keeper, region 2: ")) << events_;
-  EXPECT_TRUE(Happened("region 1: is protected by a copy again")) << events_;
+  EXPECT_TRUE(Happened("CopyLost, region 1: is not protected by a copy: its keeper, region 2: ")) << events_;
+  EXPECT_TRUE(Happened("CopyRecovered, region 1: is protected by a copy again")) << events_;
   EXPECT_FALSE(Happened("is not protected by checkpoints")) << events_;
   EXPECT_GT(result_.status.regions[1].report.copy_failures(), 0);
   ExpectExact(options);
@@ -389,9 +390,11 @@ TEST_F(Recovery, RegionThatCannotWriteGoesOnAndSaysSo) {
     return true;
   });
   ASSERT_TRUE(s.ok()) << s;
-  EXPECT_NE(events_.find("region 1: is not protected by checkpoints: cannot write " + data.string()), std::string::npos)
+  EXPECT_NE(events_.find("StorageFailed, region 1: is not protected by checkpoints: cannot write " + data.string()),
+            std::string::npos)
       << events_;
-  EXPECT_NE(events_.find("region 1: is protected by checkpoints again"), std::string::npos) << events_;
+  EXPECT_NE(events_.find("StorageRecovered, region 1: is protected by checkpoints again"), std::string::npos)
+      << events_;
   EXPECT_GT(result_.status.regions[1].report.storage_failures(), 0);
   ExpectExact(options);
 }

@@ -1,6 +1,7 @@
 #include "server/control/sqlite_store.h"
 
 #include <gtest/gtest.h>
+#include <sqlite3.h>
 
 #include <cstdlib>
 #include <filesystem>
@@ -68,14 +69,35 @@ TEST_F(Store, EventsComeBackInOrder) {
   const auto store = Open();
   for (int i = 0; i < 5; ++i) {
     const std::chrono::system_clock::time_point time{std::chrono::microseconds(1000 + i)};
-    ASSERT_TRUE(store->Append({time, i - 1, "what " + std::to_string(i)}).ok());
+    ASSERT_TRUE(store->Append({time, v1::ControlEvent::COPY_LOST, i - 1, "what " + std::to_string(i)}).ok());
   }
   const auto events = store->Events(3);
   ASSERT_TRUE(events.ok());
   ASSERT_EQ(events->size(), 3u);
   EXPECT_EQ(events->front().what, "what 2");
   EXPECT_EQ(events->back().region, 3);
+  EXPECT_EQ(events->back().kind, v1::ControlEvent::COPY_LOST);
   EXPECT_EQ(events->back().time.time_since_epoch(), std::chrono::microseconds(1004));
+}
+
+TEST_F(Store, EventsOfAFileFromBeforeTheyHadKindsAreRead) {
+  fs::create_directories(path().parent_path());
+  sqlite3* db = nullptr;
+  ASSERT_EQ(sqlite3_open(path().c_str(), &db), SQLITE_OK);
+  ASSERT_EQ(sqlite3_exec(db,
+                         "CREATE TABLE events(id INTEGER PRIMARY KEY, time_us INTEGER NOT NULL, region INTEGER NOT"
+                         " NULL, what TEXT NOT NULL); INSERT INTO events(time_us, region, what) VALUES (7, 1, 'old')",
+                         nullptr, nullptr, nullptr),
+            SQLITE_OK);
+  sqlite3_close(db);
+  const auto store = Open();
+  ASSERT_TRUE(store->Append({{}, v1::ControlEvent::REGION_LEFT, 2, "new"}).ok());
+  const auto events = store->Events(3);
+  ASSERT_TRUE(events.ok()) << events.status();
+  ASSERT_EQ(events->size(), 2u);
+  EXPECT_EQ(events->front().kind, v1::ControlEvent::UNKNOWN);
+  EXPECT_EQ(events->front().what, "old");
+  EXPECT_EQ(events->back().kind, v1::ControlEvent::REGION_LEFT);
 }
 
 TEST_F(Store, DamagedFileIsNotTakenForAnEmptyOne) {

@@ -4,7 +4,6 @@
 #include <cmath>
 #include <utility>
 
-#include <absl/strings/match.h>
 #include <absl/strings/str_cat.h>
 #include <absl/strings/str_format.h>
 #include <absl/strings/str_join.h>
@@ -67,15 +66,6 @@ absl::Status Scale(int replicas, LayoutDesk* desk) {
   int rows = 1;
   for (int n = 2; !columns && n * n <= replicas; ++n) rows = replicas % n == 0 ? n : rows;
   return desk->Resize(replicas / rows, rows);
-}
-
-// A reason for an event of the run, and whether it is a warning.
-std::pair<bool, const char*> KindOf(const std::string& what) {
-  if (absl::StrContains(what, " is ended: ")) return {true, "RegionEnded"};
-  if (absl::StrContains(what, " is started: ")) return {true, "RegionReplaced"};
-  if (absl::StrContains(what, "is not protected")) return {true, "NotProtected"};
-  if (absl::StrContains(what, "is protected")) return {false, "Protected"};
-  return {false, "Region"};
 }
 
 }  // namespace
@@ -281,9 +271,7 @@ WorldRunner::Next WorldRunner::RunOnce(WorldResource world) {
   };
   RunResult result;
   const absl::Status s = RunWorld(run, allocator, observe, &result, [this](const RunEvent& event) {
-    const auto [warning, reason] = KindOf(event.what);
-    Tell(warning, reason,
-         event.region == kNoRegion ? event.what : absl::StrCat("region ", event.region, ": ", event.what));
+    Tell(IsWarning(event.kind), NameOf(event.kind), TextOf(event));
   });
   if (ends()) return Next::kOnChange;
   if (s.ok()) {
