@@ -70,6 +70,7 @@ int main(int argc, char** argv) {
   const CLI::App* certificates = aureole::AddCertificates(app, &certificates_options);
   const CLI::App* token = aureole::AddToken(app, &token_options);
   const CLI::App* world = aureole::AddWorld(app, &operate_options);
+  const CLI::App* events = aureole::AddEvents(app, &operate_options);
   const CLI::App* resize = aureole::AddResize(app, &operate_options);
   const CLI::App* drain = aureole::AddDrain(app, &operate_options);
   const CLI::App* completion = aureole::AddCompletion(app, &completion_options);
@@ -92,6 +93,7 @@ int main(int argc, char** argv) {
   if (certificates->parsed()) return aureole::RunCertificates(certificates_options);
   if (token->parsed()) return aureole::RunToken(token_options);
   if (world->parsed()) return aureole::RunWorldCommand(operate_options);
+  if (events->parsed()) return aureole::RunEvents(operate_options);
   if (resize->parsed()) return aureole::RunResize(operate_options);
   if (drain->parsed()) return aureole::RunDrain(operate_options);
   if (record->parsed()) return aureole::RunRecord(record_options);

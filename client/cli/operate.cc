@@ -6,6 +6,7 @@
 #include <thread>
 
 #include <absl/strings/str_format.h>
+#include <absl/time/time.h>
 #include <google/protobuf/util/json_util.h>
 #include <grpcpp/grpcpp.h>
 
@@ -13,6 +14,7 @@
 #include "client/cli/connect.h"
 #include "client/cli/exit_codes.h"
 #include "client/src/channel.h"
+#include "server/control/interrupts.h"
 
 namespace aureole {
 namespace {
@@ -43,15 +45,26 @@ int Call(Stub* stub, grpc::Status (Stub::*method)(grpc::ClientContext*, const Re
   return Say((stub->*method)(&context, request, response));
 }
 
+// On a line of its own.
+void PrintJson(const google::protobuf::Message& message) {
+  std::string text;
+  google::protobuf::util::JsonPrintOptions options;
+  options.always_print_primitive_fields = true;
+  options.preserve_proto_field_names = true;
+  if (google::protobuf::util::MessageToJsonString(message, &text, options).ok()) std::cout << text << std::endl;
+}
+
+void Print(const v1::ControlEvent& event, bool json) {
+  if (json) return PrintJson(event);
+  if (event.missed() > 0) std::cout << event.missed() << " events before are not kept any more\n";
+  std::cout << absl::FormatTime("%Y-%m-%dT%H:%M:%E3SZ", absl::FromUnixMicros(event.unix_us()), absl::UTCTimeZone())
+            << (event.warning() ? " warning " : " ") << v1::ControlEvent::Kind_Name(event.kind()) << " ";
+  if (event.has_region()) std::cout << "region " << event.region() << ": ";
+  std::cout << event.text() << std::endl;
+}
+
 void Print(const v1::ControlledWorld& world, bool json) {
-  if (json) {
-    std::string text;
-    google::protobuf::util::JsonPrintOptions options;
-    options.always_print_primitive_fields = true;
-    options.preserve_proto_field_names = true;
-    if (google::protobuf::util::MessageToJsonString(world, &text, options).ok()) std::cout << text << std::endl;
-    return;
-  }
+  if (json) return PrintJson(world);
   std::cout << "world " << world.name() << ", layout epoch " << world.layout_epoch()
             << (world.changing() ? ", changing" : "") << '\n';
   if (!world.refused().empty()) std::cout << "refused: " << world.refused() << '\n';
@@ -111,6 +124,15 @@ CLI::App* AddWorld(CLI::App& app, OperateOptions* o) {
   return c;
 }
 
+CLI::App* AddEvents(CLI::App& app, OperateOptions* o) {
+  CLI::App* c = app.add_subcommand("events", "What has happened to a running world and its servers");
+  AddControl(c, o);
+  c->add_flag("--follow", o->follow, "Go on with what happens, over control planes that come and go");
+  c->add_option("--after", o->after, "Only events after the one with this sequence (--json tells it)");
+  c->footer(std::string("Example:\n  aureole events --control 127.0.0.1:40000 --follow\n\n") + kExitCodesHelp);
+  return c;
+}
+
 CLI::App* AddResize(CLI::App& app, OperateOptions* o) {
   CLI::App* c = app.add_subcommand("resize", "Divide a running world between more servers, or fewer");
   AddControl(c, o);
@@ -136,6 +158,38 @@ int RunWorldCommand(const OperateOptions& o) {
   const int code = Call(Reach(o).get(), &Stub::GetWorld, v1::GetControlledWorldRequest(), &world);
   if (code == kExitOk) Print(world, o.json);
   return code;
+}
+
+int RunEvents(const OperateOptions& o) {
+  const std::unique_ptr<Stub> stub = Reach(o);
+  v1::WatchEventsRequest request;
+  request.set_after_sequence(o.after);
+  request.set_follow(o.follow);
+  using Clock = std::chrono::steady_clock;
+  auto lost = Clock::now();  // since when there is no control plane
+  for (;;) {
+    const auto begun = Clock::now();
+    bool heard = false;
+    grpc::ClientContext context;
+    if (!o.follow) context.set_deadline(std::chrono::system_clock::now() + kPatience);
+    const std::jthread interrupted([&context](const std::stop_token& stop) {
+      while (!stop.stop_requested() && Interrupts() == 0) std::this_thread::sleep_for(kLookEvery);
+      if (!stop.stop_requested()) context.TryCancel();
+    });
+    const auto stream = stub->WatchEvents(&context, request);
+    v1::ControlEvent event;
+    while (stream->Read(&event)) {
+      Print(event, o.json);
+      request.set_after_sequence(event.sequence());
+      heard = true;
+    }
+    const grpc::Status s = stream->Finish();
+    if (Interrupts() > 0) return o.follow ? kExitOk : kExitInterrupted;
+    if (!o.follow || s.error_code() != grpc::StatusCode::UNAVAILABLE) return Say(s);
+    if (heard || Clock::now() - begun > kPatience) lost = Clock::now();
+    if (Clock::now() - lost > kPatience) return Say(s);
+    std::this_thread::sleep_for(kLookEvery);
+  }
 }
 
 int RunResize(const OperateOptions& o) {

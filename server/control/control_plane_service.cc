@@ -26,8 +26,8 @@ grpc::ServerUnaryReactor* Finish(grpc::CallbackServerContext* context, const grp
 
 }  // namespace
 
-ControlPlaneService::ControlPlaneService(LayoutDesk& desk, std::function<RunStatus()> status)
-    : desk_(desk), status_(std::move(status)) {}
+ControlPlaneService::ControlPlaneService(LayoutDesk& desk, EventLog& events, std::function<RunStatus()> status)
+    : desk_(desk), events_(events), status_(std::move(status)) {}
 
 grpc::ServerUnaryReactor* ControlPlaneService::GetWorld(grpc::CallbackServerContext* context,
                                                         const v1::GetControlledWorldRequest*,
@@ -60,6 +60,11 @@ grpc::ServerUnaryReactor* ControlPlaneService::GetWorld(grpc::CallbackServerCont
     out->set_frame_p99_ms(from.frame.p99_ms());
   }
   return Finish(context, grpc::Status::OK);
+}
+
+grpc::ServerWriteReactor<v1::ControlEvent>* ControlPlaneService::WatchEvents(grpc::CallbackServerContext* context,
+                                                                             const v1::WatchEventsRequest* request) {
+  return events_.Watch(context, *request);
 }
 
 grpc::ServerUnaryReactor* ControlPlaneService::ResizeLayout(grpc::CallbackServerContext* context,

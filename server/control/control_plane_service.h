@@ -5,6 +5,7 @@
 #include <string>
 
 #include "aureole/v1/control_plane.grpc.pb.h"
+#include "server/control/event_log.h"
 #include "server/control/layout_desk.h"
 #include "server/control/run_status.h"
 
@@ -13,11 +14,13 @@ namespace aureole {
 // Thread-safe; no call blocks.
 class ControlPlaneService final : public v1::ControlPlane::CallbackService {
  public:
-  // `desk` outlives it, and so does what `status` needs, which any thread calls.
-  ControlPlaneService(LayoutDesk& desk, std::function<RunStatus()> status);
+  // `desk` and `events` outlive it, and so does what `status` needs, which any thread calls.
+  ControlPlaneService(LayoutDesk& desk, EventLog& events, std::function<RunStatus()> status);
 
   grpc::ServerUnaryReactor* GetWorld(grpc::CallbackServerContext* context, const v1::GetControlledWorldRequest* request,
                                      v1::ControlledWorld* response) override;
+  grpc::ServerWriteReactor<v1::ControlEvent>* WatchEvents(grpc::CallbackServerContext* context,
+                                                          const v1::WatchEventsRequest* request) override;
   grpc::ServerUnaryReactor* ResizeLayout(grpc::CallbackServerContext* context, const v1::ResizeLayoutRequest* request,
                                          v1::ResizeLayoutResponse* response) override;
   grpc::ServerUnaryReactor* DrainRegion(grpc::CallbackServerContext* context, const v1::DrainRegionRequest* request,
@@ -25,6 +28,7 @@ class ControlPlaneService final : public v1::ControlPlane::CallbackService {
 
  private:
   LayoutDesk& desk_;
+  EventLog& events_;
   const std::function<RunStatus()> status_;
 };
 

@@ -95,6 +95,7 @@ int main(int argc, char** argv) {
   if (checkpoint_s > 0) options.checkpoint_every = aureole::TicksIn(checkpoint_s, tick_us);
 
   std::unique_ptr<aureole::SqliteStore> store;
+  std::vector<aureole::RunEvent> before;
   if (!store_path.empty()) {
     if (options.checkpoint_every == 0) {
       std::cerr << "--store: servers that go on by themselves need checkpoints; leave --checkpoint-every as it is\n";
@@ -106,6 +107,12 @@ int main(int argc, char** argv) {
       return kFailed;
     }
     store = *std::move(opened);
+    absl::StatusOr<std::vector<aureole::RunEvent>> kept = store->Events(aureole::EventLog::kMostEvents);
+    if (!kept.ok()) {
+      std::cerr << "--store: " << kept.status().message() << '\n';
+      return kFailed;
+    }
+    before = *std::move(kept);
     const std::filesystem::path beside = std::filesystem::absolute(store_path).parent_path();
     if (servers.log_directory.empty()) servers.log_directory = beside / "logs";
     if (servers.data_directory.empty()) servers.data_directory = beside / "data";
@@ -114,6 +121,8 @@ int main(int argc, char** argv) {
     options.control_epoch = store->epoch();
     options.leave = &aureole::Terminated();
   }
+  aureole::EventLog events(std::move(before));
+  options.events = &events;
   servers.verbose = true;
   servers.flags = aureole::FlagsOf(options.security);
   options.security.log = [](const std::string& what) { std::cerr << "[control] " << what << '\n'; };

@@ -68,6 +68,7 @@ class Runner {
     }
     if (options_.hub != nullptr) options_.hub->Remove(options_.world_name);
     if (service_ != nullptr) service_->Close();
+    events().End();
     if (server_ != nullptr) server_->Shutdown(std::chrono::system_clock::now() + std::chrono::seconds(1));
     if (service_ != nullptr) {
       result->status = service_->Status();
@@ -189,7 +190,7 @@ class Runner {
     security_->Listen(&builder, listen, &port);
     security_->guard().Register(&builder, v1::Control::service_full_name(), service_.get());
     if (options_.layouts != nullptr) {
-      operators_ = std::make_unique<ControlPlaneService>(*options_.layouts,
+      operators_ = std::make_unique<ControlPlaneService>(*options_.layouts, events(),
                                                          [service = service_.get()] { return service->Status(); });
       security_->guard().Register(&builder, v1::ControlPlane::service_full_name(), operators_.get());
       security_->guard().ServeWorld(options_.layouts->world().name);
@@ -397,7 +398,7 @@ class Runner {
   }
 
   void TellOfFailure(RegionId region, const char* by, const std::string& failure, std::string* told, EventKind failed,
-                     EventKind recovered) const {
+                     EventKind recovered) {
     if (failure.empty() != told->empty()) {
       Tell(failure.empty() ? recovered : failed, region,
            failure.empty() ? absl::StrCat("is protected by ", by, " again")
@@ -406,8 +407,11 @@ class Runner {
     *told = failure;
   }
 
-  void Tell(EventKind kind, RegionId region, const std::string& what) const {
-    if (on_event_) on_event_({std::chrono::system_clock::now(), kind, region, what});
+  EventLog& events() { return options_.events != nullptr ? *options_.events : own_events_; }
+
+  void Tell(EventKind kind, RegionId region, const std::string& what) {
+    const RunEvent event = events().Add({std::chrono::system_clock::now(), kind, region, what});
+    if (on_event_) on_event_(event);
   }
 
   absl::Status StopAll(const std::string& reason) {
@@ -430,6 +434,7 @@ class Runner {
   const RunOptions& options_;
   Allocator& allocator_;
   const EventObserver& on_event_;
+  EventLog own_events_;
   std::unique_ptr<Security> security_;
   std::unique_ptr<ControlService> service_;
   std::unique_ptr<ControlPlaneService> operators_;

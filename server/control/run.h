@@ -13,6 +13,7 @@
 #include "server/control/allocator.h"
 #include "server/control/control_hub.h"
 #include "server/control/control_service.h"
+#include "server/control/event_log.h"
 #include "server/control/layout_desk.h"
 #include "server/control/run_event.h"
 #include "server/control/run_status.h"
@@ -40,6 +41,8 @@ struct RunOptions {
   WorldStore* store = nullptr;
   // What operators want of the layout. Null: it stays as it is. Outlives the run.
   LayoutDesk* layouts = nullptr;
+  // What happens, for those who watch. Null: known only while the run lasts. Outlives the run.
+  EventLog* events = nullptr;
   uint64_t control_epoch = 1;  // grows with each control plane of the world; servers obey no lower one
   // Once it is true, RunWorld returns and the servers go on without a control plane. Needs a store.
   const std::atomic<bool>* leave = nullptr;

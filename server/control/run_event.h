@@ -2,6 +2,7 @@
 #pragma once
 
 #include <chrono>
+#include <cstdint>
 #include <string>
 
 #include "aureole/v1/control_plane.pb.h"
@@ -17,6 +18,7 @@ struct RunEvent {
   EventKind kind = v1::ControlEvent::UNKNOWN;
   RegionId region = kNoRegion;  // kNoRegion: the world
   std::string what;
+  uint64_t sequence = 0;  // greater than those before; EventLog gives it
 };
 
 // Whether somebody should look.

@@ -8,10 +8,10 @@
 
 #include <absl/strings/str_cat.h>
 
+#include "server/control/event_log.h"
+
 namespace aureole {
 namespace {
-
-constexpr int kMostEvents = 10'000;
 
 absl::Status ErrorOf(sqlite3* db, int code) {
   const std::string message = absl::StrCat("the store: ", sqlite3_errmsg(db));
@@ -130,19 +130,20 @@ absl::Status SqliteStore::Save(const v1::WorldRecord& record) {
 
 absl::Status SqliteStore::Append(const RunEvent& event) {
   const auto since = event.time.time_since_epoch();
-  Statement insert(db_, "INSERT INTO events(time_us, region, what, kind) VALUES (?, ?, ?, ?)");
+  Statement insert(db_, "INSERT INTO events(time_us, region, what, kind, id) VALUES (?, ?, ?, ?, ?)");
   insert.Bind(1, std::chrono::duration_cast<std::chrono::microseconds>(since).count());
   insert.Bind(2, event.region);
   insert.Bind(3, event.what);
   insert.Bind(4, event.kind);
+  insert.Bind(5, static_cast<int64_t>(event.sequence));
   if (absl::Status s = insert.Step().status(); !s.ok()) return s;
-  Statement trim(db_, "DELETE FROM events WHERE id <= (SELECT MAX(id) FROM events) - ?");
-  trim.Bind(1, kMostEvents);
+  Statement trim(db_, "DELETE FROM events WHERE id <= (SELECT id FROM events ORDER BY id DESC LIMIT 1 OFFSET ?)");
+  trim.Bind(1, static_cast<int64_t>(EventLog::kMostEvents));
   return trim.Step().status();
 }
 
 absl::StatusOr<std::vector<RunEvent>> SqliteStore::Events(int most) {
-  Statement select(db_, "SELECT time_us, kind, region, what FROM events ORDER BY id DESC LIMIT ?");
+  Statement select(db_, "SELECT time_us, kind, region, what, id FROM events ORDER BY id DESC LIMIT ?");
   select.Bind(1, most);
   std::vector<RunEvent> out;
   for (;;) {
@@ -152,7 +153,8 @@ absl::StatusOr<std::vector<RunEvent>> SqliteStore::Events(int most) {
     const auto kind = static_cast<int>(select.Integer(1));
     out.push_back({std::chrono::system_clock::time_point(std::chrono::microseconds(select.Integer(0))),
                    v1::ControlEvent::Kind_IsValid(kind) ? static_cast<EventKind>(kind) : v1::ControlEvent::UNKNOWN,
-                   static_cast<RegionId>(select.Integer(2)), select.Bytes(3)});
+                   static_cast<RegionId>(select.Integer(2)), select.Bytes(3),
+                   static_cast<uint64_t>(select.Integer(4))});
   }
   std::reverse(out.begin(), out.end());
   return out;

@@ -26,7 +26,7 @@ class SqliteStore final : public WorldStore {
 
   // How many control planes have opened the file, this one included: each one's epoch is higher than those before.
   uint64_t epoch() const { return epoch_; }
-  // Keeps the newest 10,000.
+  // Of ascending sequence. Keeps the newest EventLog::kMostEvents.
   absl::Status Append(const RunEvent& event);
   // The newest `most`, oldest first.
   absl::StatusOr<std::vector<RunEvent>> Events(int most);

@@ -159,6 +159,7 @@ const std::map<std::string, Access>& MethodAccess() {
       {"aureole.v1.Simulation.RemoveBodies", kSpawn},
       {"aureole.v1.Recording.Record", kOperate},
       {"aureole.v1.ControlPlane.GetWorld", kWatch},
+      {"aureole.v1.ControlPlane.WatchEvents", kOperate},  // they name files and machines
       {"aureole.v1.ControlPlane.ResizeLayout", kOperate},
       {"aureole.v1.ControlPlane.DrainRegion", kOperate},
   };

@@ -173,11 +173,30 @@ class Processes(Cli):
             second, lines = control()
             wait_for(lambda: sum("a control plane of epoch 2 is there" in line for line in lines) == 4, "four join again")
             self.assertEqual(servers(), pids)
+            os.kill(pids[0], signal.SIGKILL)
+            wait_for(lambda: any("incarnation 2 is started" in line for line in lines), "replaced")
+            wait_for(lambda: pids[0] not in servers() and len(servers()) == 4, "its successor")
+            pids = servers()
             second.terminate()
             self.assertEqual(second.wait(DEADLINE_S), 0)
             wait_for(lambda: any("left; 4 servers go on" in line for line in lines), "told")
             self.assertTrue(all(alive(pid) for pid in pids))
             third, _ = control()
+            words = pathlib.Path("/proc", str(pids[0]), "cmdline").read_text().split("\0")
+            address = words[words.index("--control") + 1]
+            out = subprocess.run([AUREOLE, "events", "--control", address, "--json"], stdout=subprocess.PIPE, text=True,
+                                 timeout=DEADLINE_S, check=True).stdout
+            event = json.loads(out)
+            self.assertEqual((event["kind"], event["warning"]), ("REGION_REPLACED", True), "of the control plane before")
+            again = subprocess.run([AUREOLE, "events", "--control", address, "--after", event["sequence"]],
+                                   stdout=subprocess.PIPE, text=True, timeout=DEADLINE_S, check=True).stdout
+            self.assertEqual(again, "")
+            follower = subprocess.Popen([AUREOLE, "events", "--control", address, "--follow"], stdout=subprocess.PIPE,
+                                        text=True)
+            self.addCleanup(follower.kill)
+            self.assertIn(" warning REGION_REPLACED region ", follower.stdout.readline())
+            follower.send_signal(signal.SIGINT)
+            self.assertEqual(follower.wait(DEADLINE_S), 0)
             third.send_signal(signal.SIGINT)
             self.assertEqual(third.wait(DEADLINE_S), 0)
             self.assertFalse(any(alive(pid) for pid in pids))

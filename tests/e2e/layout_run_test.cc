@@ -213,6 +213,17 @@ TEST_F(LayoutRunTest, OperatorsResizeAndDrainByCalls) {
     EXPECT_TRUE(s.ok()) << s.error_message();
     return out;
   };
+  const auto events = [&] {
+    const auto stub = v1::ControlPlane::NewStub(grpc::CreateChannel(control, grpc::InsecureChannelCredentials()));
+    grpc::ClientContext context;
+    context.set_deadline(std::chrono::system_clock::now() + std::chrono::seconds(10));
+    const auto stream = stub->WatchEvents(&context, {});
+    std::vector<EventKind> out;
+    for (v1::ControlEvent event; stream->Read(&event);) out.push_back(event.kind());
+    EXPECT_TRUE(stream->Finish().ok());
+    return out;
+  };
+  std::vector<EventKind> kinds;
   // What a client hears that watches a server which stays.
   std::string server;
   std::vector<v1::GetWorldResponse> heard;
@@ -248,6 +259,7 @@ TEST_F(LayoutRunTest, OperatorsResizeAndDrainByCalls) {
          EXPECT_EQ(now.regions(1).endpoint(), "");
          EXPECT_GT(now.regions(0).tick(), 0);
          EXPECT_FALSE(now.changing());
+         kinds = events();
        }},
       [&](const RunStatus& status) {
         control = status.control;
@@ -255,6 +267,10 @@ TEST_F(LayoutRunTest, OperatorsResizeAndDrainByCalls) {
         return true;
       });
   watcher.join();
+  using Event = v1::ControlEvent;
+  EXPECT_EQ(kinds, (std::vector<EventKind>{Event::LAYOUT_PROPOSED, Event::REGION_JOINS, Event::LAYOUT_IN_FORCE,
+                                           Event::LAYOUT_PROPOSED, Event::LAYOUT_IN_FORCE, Event::LAYOUT_PROPOSED,
+                                           Event::REGION_LEAVES, Event::LAYOUT_IN_FORCE, Event::REGION_LEFT}));
   // Begun, three columns, one without area, two columns.
   ASSERT_EQ(heard.size(), 4u);
   for (size_t i = 0; i < heard.size(); ++i) EXPECT_EQ(heard[i].layout_epoch(), i + 1);

@@ -148,7 +148,8 @@ class GuardedServer {
   ControlService control_;
   const World world_{*Layout::Columns({})};
   LayoutDesk desk_{world_};
-  ControlPlaneService operators_{desk_, [] { return RunStatus(); }};
+  EventLog events_;
+  ControlPlaneService operators_{desk_, events_, [] { return RunStatus(); }};
   PeerLink link_;
   int port_ = 0;
   std::unique_ptr<grpc::Server> server_;

@@ -69,13 +69,15 @@ TEST_F(Store, EventsComeBackInOrder) {
   const auto store = Open();
   for (int i = 0; i < 5; ++i) {
     const std::chrono::system_clock::time_point time{std::chrono::microseconds(1000 + i)};
-    ASSERT_TRUE(store->Append({time, v1::ControlEvent::COPY_LOST, i - 1, "what " + std::to_string(i)}).ok());
+    ASSERT_TRUE(
+        store->Append({time, v1::ControlEvent::COPY_LOST, i - 1, "what " + std::to_string(i), 10u * (i + 1)}).ok());
   }
   const auto events = store->Events(3);
   ASSERT_TRUE(events.ok());
   ASSERT_EQ(events->size(), 3u);
   EXPECT_EQ(events->front().what, "what 2");
   EXPECT_EQ(events->back().region, 3);
+  EXPECT_EQ(events->back().sequence, 50u);
   EXPECT_EQ(events->back().kind, v1::ControlEvent::COPY_LOST);
   EXPECT_EQ(events->back().time.time_since_epoch(), std::chrono::microseconds(1004));
 }
@@ -91,7 +93,7 @@ TEST_F(Store, EventsOfAFileFromBeforeTheyHadKindsAreRead) {
             SQLITE_OK);
   sqlite3_close(db);
   const auto store = Open();
-  ASSERT_TRUE(store->Append({{}, v1::ControlEvent::REGION_LEFT, 2, "new"}).ok());
+  ASSERT_TRUE(store->Append({{}, v1::ControlEvent::REGION_LEFT, 2, "new", 12}).ok());
   const auto events = store->Events(3);
   ASSERT_TRUE(events.ok()) << events.status();
   ASSERT_EQ(events->size(), 2u);

@@ -217,6 +217,7 @@ WorldRunner::Next WorldRunner::RunOnce(WorldResource world) {
 
   RunOptions run = world.run;
   run.layouts = &desk;
+  run.events = &events_;
   run.hub = context_->hub;
   run.advertise = context_->advertise;
   run.store = &store_;

@@ -87,6 +87,7 @@ class WorldRunner {
   const std::string space_, name_, uid_;
   StatusStore store_;
   PodDefaults defaults_;  // with the image that the world began with
+  EventLog events_;
   std::string told_phase_;
   std::atomic<bool> stopping_ = false, done_ = false;
 
