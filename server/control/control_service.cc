@@ -16,6 +16,7 @@ constexpr size_t kRecentReports = 5;    // of 200 ms: one second
 constexpr size_t kMaxHashes = 1 << 20;  // 40 MB; an hour at every tick is a quarter of it
 constexpr size_t kMaxWindows = 4096;    // 5.7 h
 constexpr size_t kMaxViolations = 64;
+constexpr std::chrono::milliseconds kLongestLeave = std::chrono::hours(24);
 
 grpc::Status ToGrpc(const absl::Status& s) {
   return {static_cast<grpc::StatusCode>(s.code()), std::string(s.message())};
@@ -202,6 +203,14 @@ absl::Status ControlService::Handle(Session* session, const v1::FromRegion& mess
       return absl::OkStatus();
     case v1::FromRegion::kGoodbye:
       record->status.goodbye = message.goodbye().reason();
+      record->status.gone = message.goodbye().left();
+      return absl::OkStatus();
+    case v1::FromRegion::kLeaving:
+      record->status.asks_to_leave = true;
+      record->status.leaves_by =
+          std::chrono::steady_clock::now() +
+          std::min(std::chrono::milliseconds(std::max<int64_t>(0, message.leaving().within_ms())), kLongestLeave);
+      Changed();
       return absl::OkStatus();
     default:
       return absl::InvalidArgumentError("a message of no known kind; the protocol versions differ");
@@ -341,6 +350,8 @@ void ControlService::Expect(RegionId region, uint64_t incarnation, const std::st
   status.incarnation = incarnation;
   status.joined = status.ready = status.finished = status.left = false;
   status.goodbye.clear();
+  status.gone = status.asks_to_leave = false;
+  status.leaves_by.reset();
   status.fetched.clear();
   status.pid = 0;
   status.reported = std::chrono::steady_clock::now();
@@ -511,6 +522,7 @@ void ControlService::Retire(RegionId region) {
   RegionRecord& gone = regions_[static_cast<size_t>(region)];
   gone.retired = true;
   gone.joins.reset();
+  gone.status.leaves_by.reset();
   gone.status.endpoint.clear();
   gone.status.report.Clear();
   gone.status.member = gone.status.ready = false;
@@ -532,6 +544,16 @@ void ControlService::ChangeLayout(RegionId to, uint64_t sequence, const LayoutCh
 std::optional<v1::LayoutOutcome> ControlService::TakeLayoutOutcome() {
   const std::lock_guard lock(mutex_);
   return std::exchange(layout_outcome_, std::nullopt);
+}
+
+void ControlService::AnswerLeaving(RegionId region, const std::string& refused) {
+  v1::ToRegion message;
+  message.mutable_leaving_answer()->set_refused(refused);
+  const std::lock_guard lock(mutex_);
+  RegionRecord& record = regions_[static_cast<size_t>(region)];
+  record.status.asks_to_leave = false;
+  if (!refused.empty()) record.status.leaves_by.reset();
+  if (record.session != nullptr) record.session->Send(std::move(message));
 }
 
 void ControlService::SetLayout(const LayoutChange& layout) {

@@ -81,6 +81,8 @@ class ControlService final : public v1::Control::CallbackService {
   void ChangeLayout(RegionId to, uint64_t sequence, const LayoutChange& layout);
   // What became of a change, as the newest answer to ChangeLayout says, once.
   std::optional<v1::LayoutOutcome> TakeLayoutOutcome();
+  // Answers the region's server that was told to end: it leaves, or why it cannot.
+  void AnswerLeaving(RegionId region, const std::string& refused);
   // This layout is in force.
   void SetLayout(const LayoutChange& layout);
   // Tells every server that is here to end.

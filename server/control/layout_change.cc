@@ -23,6 +23,7 @@ const RegionSeen& Seen(const LayoutObserved& o, RegionId r) {
 
 LayoutStep Await(const LayoutObserved& o) {
   const LayoutChange& change = *o.proposed;
+  if (o.withdrawn) return {Kind::kDrop};
   // All adopt a layout at the same tick, so one who says that it is in force speaks for all.
   const bool in_force = std::any_of(o.now.members.begin(), o.now.members.end(),
                                     [&](RegionId r) { return Seen(o, r).epoch >= change.epoch; });

@@ -30,9 +30,10 @@ struct LayoutObserved {
   LayoutChange now;          // in force
   std::vector<Rect> wanted;  // by region, as in LayoutChange; empty: nothing else
   std::optional<LayoutChange> proposed;
-  bool offered = false;   // to a server that is still there, and has not answered
-  bool accepted = false;  // it has answered: `proposed` is in force
-  bool refused = false;   // it has answered: `proposed` comes to nothing
+  bool offered = false;    // to a server that is still there, and has not answered
+  bool accepted = false;   // it has answered: `proposed` is in force
+  bool refused = false;    // it has answered: `proposed` comes to nothing
+  bool withdrawn = false;  // nobody has been offered `proposed`, nor is anybody to be
   std::vector<RegionSeen> regions;
 };
 

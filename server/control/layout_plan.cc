@@ -37,6 +37,12 @@ double Overlap(const Rect& a, const Rect& b) {
   return x > 0 && z > 0 ? x * z : 0;
 }
 
+absl::Status CheckArea(const LayoutChange& now, RegionId region) {
+  const bool known = region >= 0 && static_cast<size_t>(region) < now.regions.size();
+  if (known && now.regions[static_cast<size_t>(region)].HasArea()) return absl::OkStatus();
+  return absl::InvalidArgumentError(absl::StrCat("region: ", region, " has no area; ask for the layout first"));
+}
+
 }  // namespace
 
 absl::StatusOr<std::vector<Rect>> EqualCells(const World& world, int columns, int rows) {
@@ -90,11 +96,27 @@ std::vector<Rect> AssignCells(const LayoutChange& now, const std::vector<Rect>& 
   return out;
 }
 
-absl::StatusOr<std::vector<Rect>> WithoutArea(const LayoutChange& now, RegionId region) {
-  if (region < 0 || static_cast<size_t>(region) >= now.regions.size() ||
-      !now.regions[static_cast<size_t>(region)].HasArea()) {
-    return absl::InvalidArgumentError(absl::StrCat("region: ", region, " has no area; ask for the layout first"));
+absl::StatusOr<StandIn> WithStandIn(const LayoutChange& now, RegionId region, const std::vector<RegionId>& busy) {
+  if (absl::Status s = CheckArea(now, region); !s.ok()) return s;
+  const auto contains = [](const std::vector<RegionId>& list, RegionId r) {
+    return std::find(list.begin(), list.end(), r) != list.end();
+  };
+  StandIn out{0, now.regions};
+  const auto size = static_cast<RegionId>(out.regions.size());
+  while (contains(now.members, out.region) || contains(busy, out.region) ||
+         (out.region < size && out.regions[static_cast<size_t>(out.region)].HasArea())) {
+    ++out.region;
   }
+  if (out.region >= limits::kMaxRegions) {
+    return absl::ResourceExhaustedError(absl::StrCat("all ", limits::kMaxRegions, " regions of a world are in use"));
+  }
+  out.regions.resize(std::max(out.regions.size(), static_cast<size_t>(out.region) + 1));
+  std::swap(out.regions[static_cast<size_t>(region)], out.regions[static_cast<size_t>(out.region)]);
+  return out;
+}
+
+absl::StatusOr<std::vector<Rect>> WithoutArea(const LayoutChange& now, RegionId region) {
+  if (absl::Status s = CheckArea(now, region); !s.ok()) return s;
   const Rect gone = now.regions[static_cast<size_t>(region)];
   std::vector<Rect> out = now.regions;
   out[static_cast<size_t>(region)] = {};

@@ -19,6 +19,14 @@ absl::StatusOr<std::vector<Rect>> EqualCells(const World& world, int columns, in
 std::vector<Rect> AssignCells(const LayoutChange& now, const std::vector<Rect>& cells,
                               const std::vector<RegionId>& busy = {});
 
+// The same layout, but the lowest region that is free has the region's area: it has none, is no member, and is not in
+// `busy`. InvalidArgument: no such region; ResourceExhausted: none is free.
+struct StandIn {
+  RegionId region = kNoRegion;
+  std::vector<Rect> regions;
+};
+absl::StatusOr<StandIn> WithStandIn(const LayoutChange& now, RegionId region, const std::vector<RegionId>& busy = {});
+
 // The same layout, but a neighbour has the region's area too. InvalidArgument: no such region, or it is the last one;
 // FailedPrecondition: no other shares a whole side with it.
 absl::StatusOr<std::vector<Rect>> WithoutArea(const LayoutChange& now, RegionId region);

@@ -1,5 +1,9 @@
 // Carries out the changes of one run's layout, one step at each look at its servers (layout_change.h), and knows which
 // regions have a server.
+//
+// A server that was told to end (RegionStatus::leaves_by) leaves by such changes too: what is wanted is then wanted of
+// a stand-in, a region that is free, and so the old one leaves as it loses its area. When the stand-in's server does
+// not come in time, a neighbour has the area until the old one has left.
 #pragma once
 
 #include <chrono>
@@ -51,12 +55,23 @@ class LayoutRun {
 
  private:
   using Clock = std::chrono::steady_clock;
+  struct Place {
+    RegionId by = kNoRegion;      // the stand-in
+    Clock::time_point late_from;  // unless it has joined
+    bool left = false;            // the region whose place it takes, and its server has ended
+  };
   struct Offer {
     RegionId to = kNoRegion;
     uint64_t incarnation = 0;
     Clock::time_point at;
   };
 
+  // Regions whose servers were told to end.
+  void LetLeave(const RunStatus& status);
+  absl::Status StandIn(RegionId region, const RegionStatus& status);
+  void WatchStandIns();
+  void TakeBack(RegionId region);
+  std::vector<Rect> Wish() const;
   LayoutObserved Observe(const RunStatus& status) const;
   void Propose(const LayoutChange& change);
   void Adopt();
@@ -71,11 +86,15 @@ class LayoutRun {
   std::optional<LayoutChange> proposed_;
   uint64_t sequence_ = 0;
   std::optional<Offer> offer_;
+  bool offered_ = false;    // what is proposed, to anybody, as far as is known
+  bool withdrawn_ = false;  // what is proposed, and was not offered
   std::optional<v1::LayoutOutcome> outcome_;
   std::string refused_;
   std::map<RegionId, v1::LayoutChange> joins_;
-  std::set<RegionId> leaving_;  // no members any more, and their servers have not ended
-  std::set<RegionId> ending_;   // were to join and will not; their servers have been told to end
+  std::set<RegionId> leaving_;           // no members any more, and their servers have not ended
+  std::map<RegionId, Place> stand_ins_;  // by the region that leaves; of whom the stand-in has not joined
+  bool late_ = false;                    // neighbours have what stand-ins are to have
+  std::set<RegionId> ending_;            // were to join and will not; their servers have been told to end
 };
 
 }  // namespace aureole

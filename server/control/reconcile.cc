@@ -22,12 +22,15 @@ void ReconcileRegion(RegionId region, const RegionObserved& r, bool recovers, st
   const auto act = [&](Action::Kind kind, uint64_t incarnation, std::string why) {
     out->push_back({kind, region, incarnation, std::move(why)});
   };
+  // One that has joined is told to end, and does.
+  if (!r.wanted && r.alive && !r.joined) return act(Action::Kind::kEnd, r.incarnation, "it is not needed any more");
   if (!r.wanted || (r.leaves && !r.alive && r.clean)) return;
   if (r.joins) return act(Action::Kind::kStart, r.incarnation + 1, "the region joins the world");
   if (r.incarnation == 0) return act(Action::Kind::kStart, 1, "the world begins");
   const std::string lost = r.alive ? Lost(r, recovers) : r.how;
   if (lost.empty() || (!r.alive && r.clean && r.finished)) return;
-  if (!recovers || r.failures >= kMostFailures) return act(Action::Kind::kGiveUp, r.incarnation, lost);
+  // Who is to join is tried again: the world goes on without.
+  if (!recovers || (r.member && r.failures >= kMostFailures)) return act(Action::Kind::kGiveUp, r.incarnation, lost);
   // Two servers of a region must not write to one directory: the next one starts when the allocator says that the last
   // one is gone.
   if (r.alive) return act(Action::Kind::kEnd, r.incarnation, lost);

@@ -25,6 +25,7 @@ struct RegionObserved {
   bool wanted = true;        // the region is to have a server
   bool leaves = false;       // it ends by itself, with exit status 0, and then the region is to have none
   bool joins = false;        // no server of the region was started since it was given its name
+  bool member = true;        // the world waits for it
 };
 
 struct Observed {

@@ -256,7 +256,9 @@ class Runner {
         servers_[i].incarnation = last;
         servers_[i].joins = true;
       }
+      const bool given_up = servers_[i].wanted && !wanted && !servers_[i].alive;
       servers_[i].wanted = wanted;
+      if (given_up) layout_->Ended(static_cast<RegionId>(i), true);
     }
   }
 
@@ -275,7 +277,12 @@ class Runner {
       const bool killed = absl::StartsWith(exit.how, "killed");
       server.port_lost = !killed && !status.regions[static_cast<size_t>(exit.region)].joined;
       server.exit = exit;
-      layout_->Ended(exit.region, exit.clean);
+      // What it said last counts: its Pod may be gone before anybody saw how it ended, and one that was told to end may
+      // have ended in order before the others could do without it.
+      const RegionStatus& last = status.regions[static_cast<size_t>(exit.region)];
+      if (layout_->Leaves(exit.region) && last.leaves_by.has_value()) server.exit.clean = false;
+      server.exit.clean |= last.gone;
+      layout_->Ended(exit.region, server.exit.clean);
     }
   }
 
@@ -293,7 +300,8 @@ class Runner {
       out.regions.push_back({server.incarnation, server.alive, r.joined, r.joined && !r.left, r.finished,
                              server.exit.clean, talks || joins || r.left ? Seconds(now - r.reported) : 0,
                              Seconds(now - server.ended), server.failures, server.exit.how, server.adopted,
-                             server.wanted, layout_->Leaves(static_cast<RegionId>(i)), server.joins});
+                             server.wanted, layout_->Leaves(static_cast<RegionId>(i)), server.joins,
+                             layout_->IsMember(static_cast<RegionId>(i))});
     }
     return out;
   }

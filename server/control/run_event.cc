@@ -13,6 +13,8 @@ bool IsWarning(EventKind kind) {
     case v1::ControlEvent::STORAGE_FAILED:
     case v1::ControlEvent::COPY_LOST:
     case v1::ControlEvent::COPY_FETCHED:
+    case v1::ControlEvent::REGION_LATE:
+    case v1::ControlEvent::REGION_STAYS:
       return true;
     default:
       return false;

@@ -4,6 +4,7 @@
 #include <chrono>
 #include <cstdint>
 #include <deque>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -29,6 +30,10 @@ struct RegionStatus {
   bool left = false;               // its stream has ended
   bool member = true;   // by the layout in force, as far as is known; else it will join, or leaves, or has left
   std::string goodbye;  // the reason it gave, if any
+  bool gone = false;    // it said with it that the region has left
+  // It was told to end, and does so then if its region has not left before; whether it waits for an answer.
+  std::optional<std::chrono::steady_clock::time_point> leaves_by;
+  bool asks_to_leave = false;
   std::string fetched;  // why and where from this server's checkpoint was fetched; empty: it was not
   std::string endpoint, metrics_endpoint;
   int64_t pid = 0;

@@ -84,11 +84,13 @@ bool ControlStream::Send(v1::FromRegion message) {
   return true;
 }
 
-void ControlStream::Close(const std::string& reason) {
+void ControlStream::Close(const std::string& reason, bool left) {
   std::unique_lock lock(mutex_);
   if (!closing_) {
     closing_ = true;
-    queue_.emplace_back().mutable_goodbye()->set_reason(reason);
+    v1::Goodbye* goodbye = queue_.emplace_back().mutable_goodbye();
+    goodbye->set_reason(reason);
+    goodbye->set_left(left);
     Pump();
   }
   done_changed_.wait_for(lock, std::chrono::seconds(1), [this] { return done_; });

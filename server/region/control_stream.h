@@ -65,8 +65,9 @@ class ControlStream final : public grpc::ClientBidiReactor<v1::FromRegion, v1::T
   bool Send(v1::FromRegion message);
   // Ends the stream soon, without a word. Any thread.
   void Cancel() { context_.TryCancel(); }
-  // Says goodbye after everything that was sent, and waits for the end of the stream, at most a second.
-  void Close(const std::string& reason);
+  // Says goodbye after everything that was sent, and waits for the end of the stream, at most a second. `left`: the
+  // region has left its world.
+  void Close(const std::string& reason, bool left = false);
 
  private:
   void OnReadDone(bool ok) override;

@@ -23,6 +23,7 @@ int main(int argc, char** argv) {
   aureole::RegionServerOptions options;
   std::string health_check, log_level = "info";
   bool exit_with_parent = false;
+  double leave_within = std::chrono::duration<double>(options.leave_within).count();
   app.add_option("--control", options.control, "host:port of the control plane");
   app.add_option("--token", options.token, "says which region this process was started for");
   app.add_option("--world", options.world,
@@ -30,6 +31,12 @@ int main(int argc, char** argv) {
   app.add_option("--listen", options.listen, "host:port for peers and clients; port 0 is any")->capture_default_str();
   app.add_option("--metrics", options.metrics, "host:port of Prometheus /metrics, or off")->capture_default_str();
   app.add_option("--data", options.data, "directory for checkpoints, of this region alone; made when missing");
+  app.add_option(
+         "--leave-within", leave_within,
+         "seconds that SIGTERM leaves for the region to leave its world in order, so that it does not stop; then, "
+         "or at the next signal, the server ends and is replaced. Less than a supervisor waits before it kills")
+      ->check(CLI::Range(0.0, 86400.0))
+      ->capture_default_str();
   app.add_option("--tls", options.security.tls,
                  "directory with ca.crt, tls.crt and tls.key, read again when they change; plain text when not given");
   app.add_option("--tokens", options.security.tokens,
@@ -48,6 +55,7 @@ int main(int argc, char** argv) {
   } catch (const CLI::ParseError& e) {
     return app.exit(e) == 0 ? 0 : 2;
   }
+  options.leave_within = std::chrono::milliseconds(static_cast<int64_t>(1000 * leave_within));
   if (!health_check.empty()) {
     // Kubernetes puts no variables into a probe's command.
     if (const char* pod = std::getenv("POD_IP"); health_check[0] == ':' && pod != nullptr) health_check.insert(0, pod);

@@ -38,6 +38,8 @@ constexpr unsigned kLongestLeaveSeconds = 10;
 // Who has nothing to do yet does not wait longer than this for a control plane; the wait between two tries.
 constexpr std::chrono::seconds kLongestJoin{60};
 constexpr std::chrono::milliseconds kJoinAgainAfter{300};
+// Who was told to end waits so long for a control plane that says what becomes of its region.
+constexpr std::chrono::seconds kLongestAnswer{10};
 
 sigset_t TakenSignals() {
   sigset_t set;
@@ -130,6 +132,10 @@ struct Process {
   int64_t start_unix_us = 0;  // 0: not started
   std::chrono::steady_clock::time_point join_again = std::chrono::steady_clock::time_point::max();
   std::chrono::steady_clock::time_point give_up_joining;
+  std::chrono::milliseconds leave_within{};
+  // Once it was told to end: when it does, if its region has not left before.
+  std::optional<std::chrono::steady_clock::time_point> leaves_by;
+  std::chrono::steady_clock::time_point ends = std::chrono::steady_clock::time_point::max();
 
   TickLoop::Hooks Hooks();
   void FollowLayout(const Region& region);
@@ -137,6 +143,8 @@ struct Process {
   void Join();
   bool Report(const v1::Report& report);
   void SayLastReport();
+  bool AskToLeave();
+  void SayLeaving();
 };
 
 // Opens a stream, with what this server runs.
@@ -159,6 +167,28 @@ void Process::Join() {
   const std::lock_guard lock(control_mutex);
   control = std::move(stream);
   if (last_report.has_value()) SayLastReport();
+  if (leaves_by.has_value()) SayLeaving();
+}
+
+// The world goes on meanwhile; false: there is none that does, or it has asked already.
+bool Process::AskToLeave() {
+  if (leaves_by.has_value() || start_unix_us == 0 || leave_within.count() == 0) return false;
+  const std::lock_guard lock(control_mutex);
+  if (last_report.has_value()) return false;
+  const auto now = std::chrono::steady_clock::now();
+  leaves_by = now + leave_within;
+  ends = std::min(*leaves_by, now + kLongestAnswer);
+  server->SetServing(false);
+  SayLeaving();
+  return true;
+}
+
+// With the mutex.
+void Process::SayLeaving() {
+  const auto left = *leaves_by - std::chrono::steady_clock::now();
+  v1::FromRegion message;
+  message.mutable_leaving()->set_within_ms(std::chrono::duration_cast<std::chrono::milliseconds>(left).count());
+  control->Send(std::move(message));
 }
 
 // With the mutex.
@@ -322,7 +352,7 @@ bool ControlLost(Process* process, const Event& event, int* exit_code, std::stri
 }
 
 // True when the process should go on.
-bool HandleEvent(Process* process, const Event& event, int* exit_code, std::string* reason) {
+bool HandleEvent(Process* process, const Event& event, int* exit_code, std::string* reason, bool* left) {
   switch (event.kind) {
     case Event::Kind::kSignal:
       if (event.signal == SIGUSR1) {
@@ -331,7 +361,9 @@ bool HandleEvent(Process* process, const Event& event, int* exit_code, std::stri
         return true;
       }
       *reason = strsignal(event.signal);
-      return false;
+      if (event.signal != SIGTERM || !process->AskToLeave()) return false;
+      spdlog::info("{}: asks to leave the world", *reason);
+      return true;
     case Event::Kind::kControlLost:
       return ControlLost(process, event, exit_code, reason);
     case Event::Kind::kFenced:
@@ -340,6 +372,7 @@ bool HandleEvent(Process* process, const Event& event, int* exit_code, std::stri
       return false;
     case Event::Kind::kGone:
       *reason = "the region has left its world";
+      *left = true;
       return false;
     case Event::Kind::kMessage:
       break;
@@ -347,6 +380,12 @@ bool HandleEvent(Process* process, const Event& event, int* exit_code, std::stri
   if (event.message.has_stop()) {
     *reason = "stopped: " + event.message.stop().reason();
     return false;
+  }
+  if (event.message.has_leaving_answer() && process->leaves_by.has_value()) {
+    const std::string& refused = event.message.leaving_answer().refused();
+    *reason = "told to end, and cannot leave before: " + refused;
+    process->ends = *process->leaves_by;
+    return refused.empty();
   }
   const absl::Status s = process->Handle(event.message);
   if (s.ok()) return true;
@@ -414,15 +453,20 @@ int RunRegionServer(const RegionServerOptions& options) {
                process.server->endpoint(), process.metrics != nullptr ? process.metrics->endpoint() : "off");
   process.control_address = options.control;
   process.world = options.world;
+  process.leave_within = options.leave_within;
   process.give_up_joining = std::chrono::steady_clock::now() + kLongestJoin;
   process.Join();
 
   int exit_code = 0;
   std::string reason;
+  bool left = false;
   for (bool goes_on = true; goes_on;) {
     Event event;
-    if (process.events.PopUntil(process.join_again, &event)) {
-      goes_on = HandleEvent(&process, event, &exit_code, &reason);
+    if (process.events.PopUntil(std::min(process.join_again, process.ends), &event)) {
+      goes_on = HandleEvent(&process, event, &exit_code, &reason, &left);
+    } else if (std::chrono::steady_clock::now() >= process.ends) {
+      reason = "told to end, and has not left in time";
+      goes_on = false;
     } else {
       process.Join();
     }
@@ -437,7 +481,7 @@ int RunRegionServer(const RegionServerOptions& options) {
     // Peers may still need the last frames.
     process.hosted->links().Drain(std::chrono::seconds(1));
   }
-  process.control->Close(reason);
+  process.control->Close(reason, left);
   return exit_code;
 }
 

@@ -5,6 +5,7 @@
 
 #include "server/control/layout_change.h"
 #include "server/control/layout_plan.h"
+#include "server/core/limits.h"
 #include "server/core/partition.h"
 
 namespace aureole {
@@ -69,6 +70,24 @@ TEST(LayoutSteps, AnAnswerOrAReportEndsAProposal) {
   EXPECT_EQ(NextLayoutStep(o).kind, Kind::kDrop);
 }
 
+TEST(LayoutSteps, AProposalThatIsWithdrawnIsDropped) {
+  LayoutObserved o = Joining();
+  o.withdrawn = true;
+  EXPECT_EQ(NextLayoutStep(o).kind, Kind::kDrop);
+}
+
+TEST(LayoutSteps, AStandInJoinsAsTheOtherLosesItsArea) {
+  LayoutObserved o = Two();
+  const absl::StatusOr<StandIn> stand_in = WithStandIn(o.now, 1);
+  ASSERT_TRUE(stand_in.ok()) << stand_in.status();
+  EXPECT_EQ(stand_in->region, 2);
+  o.wanted = stand_in->regions;
+  EXPECT_EQ(o.wanted, (std::vector<Rect>{kLeft, {}, kRight}));
+  const LayoutChange change = NextLayoutStep(o).change;
+  EXPECT_EQ(change.members, (Members{0, 1, 2}));
+  EXPECT_EQ(change.regions, o.wanted);
+}
+
 TEST(LayoutSteps, ANameIsNotGivenAgainBeforeItIsFree) {
   LayoutObserved o = Two();
   o.now = {7, {kAll, {}}, {0, 1}, {0}};
@@ -120,6 +139,20 @@ TEST(LayoutPlan, CellsGoToThoseThatHaveMostOfThem) {
   EXPECT_EQ(AssignCells(now, {kLeft, kMiddle, kFarRight}), (std::vector<Rect>{kFarRight, kMiddle, kLeft}));
   EXPECT_EQ(AssignCells(now, {kLeft, kMiddle, kFarRight}, {1}), (std::vector<Rect>{kFarRight, {}, kLeft, kMiddle}));
   EXPECT_EQ(AssignCells(now, {kAll}).size(), 3u);
+}
+
+TEST(LayoutPlan, AStandInIsTheLowestRegionThatIsFree) {
+  const LayoutChange now{1, {{}, {}, kLeft, {}, kRight}, {0, 1, 2, 3, 4}, {0, 2, 4}};
+  EXPECT_EQ(WithStandIn(now, 2)->region, 1) << "0 is a member still";
+  EXPECT_EQ(WithStandIn(now, 4, {1, 3})->region, 5);
+  EXPECT_EQ(WithStandIn(now, 4, {1, 3})->regions, (std::vector<Rect>{{}, {}, kLeft, {}, {}, kRight}));
+  EXPECT_TRUE(absl::IsInvalidArgument(WithStandIn(now, 1).status()));
+  EXPECT_TRUE(absl::IsInvalidArgument(WithStandIn(now, 9).status()));
+  LayoutChange full = now;
+  full.regions.resize(limits::kMaxRegions);
+  std::vector<RegionId> busy;
+  for (RegionId r = 0; r < limits::kMaxRegions; ++r) busy.push_back(r);
+  EXPECT_TRUE(absl::IsResourceExhausted(WithStandIn(full, 4, busy).status()));
 }
 
 TEST(LayoutPlan, ANeighbourTakesTheAreaOfOneThatIsDrained) {

@@ -107,6 +107,24 @@ TEST(Reconcile, SilentServerThatCannotBeReplacedIsWaitedFor) {
   EXPECT_EQ(Decide(r, false), "");
 }
 
+TEST(Reconcile, ServerOfARegionThatShallNotJoinAfterAllIsEndedUnlessItHearsOfIt) {
+  RegionObserved r = Running();
+  r.wanted = r.member = false;
+  EXPECT_EQ(Decide(r), "") << "it was told to end";
+  r.joined = r.connected = false;
+  EXPECT_EQ(Decide(r), "end 3: it is not needed any more");
+  r.alive = false;
+  EXPECT_EQ(Decide(r), "");
+}
+
+TEST(Reconcile, ServerThatIsToJoinIsTriedAgainHoweverOftenItFailed) {
+  RegionObserved r = Dead();
+  r.failures = kMostFailures;
+  r.down_s = 100;
+  r.member = false;
+  EXPECT_EQ(Decide(r), "start 4: killed by signal 9");
+}
+
 TEST(Reconcile, RegionsThatHaveFinishedMayGo) {
   RegionObserved r = Dead("exit status 0");
   r.clean = r.finished = true;
