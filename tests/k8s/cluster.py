@@ -354,3 +354,15 @@ class WorldTest(ClusterTest):
                          {r: i for r, i in before.items() if r not in regions})
         for region in regions:
             self.assertGreater(now[region], before[region])
+
+    def left(self, before, region):
+        """Whether the region has left, and another one, maybe of the same name, is in its place."""
+        return self.world.incarnations().get(region) != before[region]
+
+    def assert_the_rest_stayed(self, before, left):
+        """These regions have left; the others have the servers that they had."""
+        now = self.world.incarnations()
+        rest = {r: i for r, i in before.items() if r not in left}
+        self.assertEqual({r: now.get(r) for r in rest}, rest)
+        for region in left:
+            self.assertNotEqual(now.get(region), before[region])

@@ -10,6 +10,7 @@ import time
 from cluster import BIN, WorldTest, kubectl, needs_the_machine, signal_pod, wait_for
 
 AGAIN_S = 10
+LEAVES_S = 1  # longest stop when a region leaves in order; about 0.3 is what the clock's metrics can tell
 
 
 class Load:
@@ -62,8 +63,17 @@ class UnderLoad(WorldTest):
 
         self.goes_on_after(kill, [0, 3])
 
-    def test_deleted_pod_is_replaced(self):
-        self.goes_on_after(lambda: kubectl("delete", "pod", self.world.pod_of(2)["metadata"]["name"], "--wait=false"), [2])
+    def test_region_of_a_deleted_pod_leaves_and_the_world_does_not_stop(self):
+        tick = self.world.ticks.now()
+        began = time.monotonic()
+        kubectl("delete", "pod", self.world.pod_of(2)["metadata"]["name"], "--wait=false")
+        wait_for(lambda: self.left(self.before, 2), "another region in its place")
+        self.world.ticks.goes_on(50)
+        self.world.runs()
+        self.measure("longest stop", self.world.ticks.longest_stop(began), LEAVES_S)
+        self.assert_exact(tick)
+        self.assert_the_rest_stayed(self.before, [2])
+        self.measure("speed since", self.world.ticks.dilation(began), unit="")
 
     def test_pod_deleted_without_grace_is_replaced(self):
         self.goes_on_after(lambda: kubectl("delete", "pod", self.world.pod_of(2)["metadata"]["name"], "--wait=false",

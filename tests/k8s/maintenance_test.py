@@ -4,7 +4,7 @@ import time
 
 from cluster import WorldTest, get, kubectl, wait_for
 
-STOP_S = 10  # longest; the aim is 2
+STOP_S = 1  # longest; about 0.3 is what the clock's metrics can tell
 
 
 def budget():
@@ -22,14 +22,14 @@ class Maintenance(WorldTest):
     def nothing_is_lost(self):
         self.world.runs()
         self.world.ticks.goes_on(50)
-        self.measure("longest stop (aim: 2 s)", self.world.ticks.longest_stop(self.since), STOP_S)
+        self.measure("longest stop", self.world.ticks.longest_stop(self.since), STOP_S)
         self.measure("speed meanwhile", self.world.ticks.dilation(self.since), unit="")
         self.assert_exact()
 
     def test_all_regions_are_restarted_one_after_the_other(self):
         for region in range(4):
             kubectl("delete", "pod", self.world.pod_of(region)["metadata"]["name"], "--wait=false")
-            wait_for(lambda: self.world.incarnations().get(region, 0) > self.before[region], "the next incarnation")
+            wait_for(lambda: self.left(self.before, region), "another region in its place")
             self.world.runs()
             self.world.ticks.goes_on(25)
         self.nothing_is_lost()
@@ -49,8 +49,8 @@ class Maintenance(WorldTest):
         kubectl("drain", node, "--ignore-daemonsets", "--force", "--delete-emptydir-data", "--timeout=120s", space=None, timeout=150)
         self.measure("drain", time.monotonic() - self.since)
         self.nothing_is_lost()
-        self.assert_others_stayed(self.before, there)
-        self.assertNotIn(node, [r["node"] for r in self.world.status()["regions"]])
+        self.assert_the_rest_stayed(self.before, there)
+        self.assertNotIn(node, [r.get("node") for r in self.world.status()["regions"]])
 
     def test_budget_lets_only_one_region_be_evicted_at_a_time(self):
         wait_for(lambda: budget() == (4, 3, 1), "four regions, of which three must stay")

@@ -144,13 +144,36 @@ TEST_F(WorldLife, RegionsRunOnDifferentNodesThoughTheyAreNeighbours) {
   EXPECT_NE(TextAt(Status()["regions"][0], {"node"}), TextAt(Status()["regions"][1], {"node"}));
 }
 
-TEST_F(WorldLife, DeletedPodIsReplaced) {
+// A node that is drained, or a restart of all: each region leaves to another one, and no server repeats anything.
+TEST_F(WorldLife, RegionsOfDeletedPodsLeaveInOrder) {
+  cluster_.StartControl(0);
+  Create(Spec());
+  ASSERT_TRUE(AwaitTick(60));
+  ApiClient people(cluster_.api().Access());
+  for (const char* pod : {"w-r0-i1", "w-r1-i1"}) {
+    ASSERT_TRUE(people.Delete({"", "v1", "pods", "test"}, pod).ok());
+  }
+  ASSERT_TRUE(Await([&] {
+    return cluster_.ProcessOf("w-r0-i1") < 0 && cluster_.ProcessOf("w-r1-i1") < 0 &&
+           TextAt(Status(), {"regionsReady"}) == "2/2";
+  }));
+  EXPECT_GT(cluster_.ProcessOf("w-r2-i1"), 0);
+  EXPECT_GT(cluster_.ProcessOf("w-r3-i1"), 0);
+  EXPECT_FALSE(HasEvent("RegionReplaced"));
+  ExpectEndAsUndisturbed();
+  EXPECT_TRUE(Await([&] { return HasEvent("RegionLeaves"); }));
+}
+
+TEST_F(WorldLife, RegionOfADeletedPodThatFallsSilentIsReplaced) {
   cluster_.StartControl(0);
   Create(Spec());
   ASSERT_TRUE(AwaitTick(100));
+  const pid_t old = cluster_.ProcessOf("w-r1-i1");
+  kill(old, SIGSTOP);
   ApiClient people(cluster_.api().Access());
   ASSERT_TRUE(people.Delete({"", "v1", "pods", "test"}, "w-r1-i1").ok());
   ASSERT_TRUE(Await([&] { return Incarnation(1) == 2; }));
+  kill(old, SIGKILL);
   EXPECT_EQ(Incarnation(0), 1u);
   ExpectEndAsUndisturbed();
   EXPECT_TRUE(Await([&] { return HasEvent("RegionReplaced"); }));

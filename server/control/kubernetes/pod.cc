@@ -10,7 +10,7 @@ namespace aureole::kubernetes {
 namespace {
 
 constexpr char kServer[] = "aureole-region", kData[] = "/data";
-constexpr int kUser = 65532, kGraceSeconds = 30;
+constexpr int kUser = 65532, kGraceSeconds = 30;  // more than a server takes to leave (--leave-within)
 // For the scheduler to weigh. Machines come first: one Pod more on a machine weighs more than all neighbours in its
 // zone, of which a grid has 8.
 constexpr int kApart = 100, kNear = 10;
