@@ -51,14 +51,14 @@ std::string FileText() {
 }
 
 // The hash of the last state of an undisturbed run.
-std::string HashOfTheEnd(int seconds) {
+std::string HashOfTheEnd(int length_s) {
   const absl::StatusOr<WorldFile> file = OpenWorldFile(kFile);
   EXPECT_TRUE(file.ok()) << file.status();
   RunOptions options;
   options.world = file->spec;
   options.regions = file->world.layout.size();
   options.no_real_time = true;
-  options.last_tick = TicksIn(seconds, file->world.environment.tick_us);
+  options.last_tick = TicksIn(length_s, file->world.environment.tick_us);
   options.hash_every = 100;
   LocalAllocator allocator({.executable = AUREOLE_REGION, .log_directory = {}});
   RunResult result;
