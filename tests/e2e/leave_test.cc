@@ -354,8 +354,8 @@ TEST_F(LeaveAcrossControlPlanes, AServerForWhichNoneComesEndsAndIsReplaced) {
 }
 
 TEST_F(LeaveAcrossControlPlanes, EachGoesOnWithWhatTheLastOneHasBegun) {
-  RunOne(3, [](const RunStatus& status) {
-    static bool told = false;
+  bool told = false;
+  RunOne(3, [&told](const RunStatus& status) {
     if (!std::exchange(told, true)) Tell(status, 0);
   });
   for (const int looks : {1, 2, 1, 3, 2, 5}) RunOne(looks);
