@@ -19,6 +19,7 @@
 #include "server/control/interrupts.h"
 #include "server/control/local_allocator.h"
 #include "server/control/run.h"
+#include "server/control/scaling_flags.h"
 #include "server/control/world_file.h"
 
 namespace aureole {
@@ -187,6 +188,7 @@ CLI::App* AddUp(CLI::App& app, UpOptions* o) {
       ->check(CLI::Range(0.0, 3600.0))
       ->capture_default_str()
       ->type_name("SECONDS");
+  AddScalingFlags(up, &o->scaling);
   up->add_option("--region-server", o->region_server, "Program to start; aureole-region beside this one when not given")
       ->type_name("FILE");
   up->add_option("--tls", o->tls,
@@ -200,6 +202,7 @@ CLI::App* AddUp(CLI::App& app, UpOptions* o) {
   up->footer(std::string("Examples:\n"
                          "  aureole up tests/worlds/demo.json\n"
                          "  aureole up tests/worlds/paper/column-4.json --duration 60s --json > result.json\n"
+                         "  aureole up tests/worlds/demo.json --regions 1..6 --awake-bodies 100 --down-after 20s\n"
                          "  aureole up tests/worlds/bridge.json --no-real-time --duration 2m --hash-every 10\n\n"
                          "Without --duration, Ctrl-C is the way to end it, and the exit code is 0.\n") +
              kExitCodesHelp);
@@ -216,6 +219,15 @@ int Up(const UpOptions& options) {
     std::cerr << file.status().message() << '\n';
     return kExitBadInput;
   }
+  absl::Status scales = CheckScalingFlags(options.scaling, file->world);
+  if (options.scaling.on() && options.undivided) {
+    scales =
+        absl::InvalidArgumentError("--regions: an undivided world has one region; leave out --regions, or --undivided");
+  }
+  if (!scales.ok()) {
+    std::cerr << scales.message() << '\n';
+    return kExitBadInput;
+  }
   Heading heading{file->world.name, file->world.environment.tick_us, 0};
   if (options.duration_s > 0) heading.last_tick = TicksIn(options.duration_s, heading.tick_us);
 
@@ -225,6 +237,7 @@ int Up(const UpOptions& options) {
   run.listen = options.control;
   LayoutDesk layouts(file->world);
   if (!options.undivided) run.layouts = &layouts;
+  run.scaling = options.scaling;
   run.undivided = options.undivided;
   run.no_real_time = options.no_real_time;
   run.last_tick = heading.last_tick;

@@ -5,6 +5,8 @@
 
 #include <CLI/CLI.hpp>
 
+#include "server/control/autoscaler.h"
+
 namespace aureole {
 
 struct UpOptions {
@@ -18,6 +20,7 @@ struct UpOptions {
   std::string control = "127.0.0.1:0";  // where servers and operators reach the control plane
   std::string logs, data, region_server;
   double checkpoint_s = 1;  // 0: none
+  ScalingOptions scaling;
   std::string tls, tokens;  // as aureole-region --help has them; empty: none
   std::string viewer;       // directory of the browser viewer; empty: none
 };

@@ -1,12 +1,26 @@
 #include "server/control/layout_desk.h"
 
+#include <algorithm>
+#include <cmath>
 #include <utility>
 
+#include "server/control/balanced_cells.h"
 #include "server/control/layout_change.h"
 #include "server/control/layout_plan.h"
+#include "server/core/limits.h"
 #include "server/core/partition.h"
 
 namespace aureole {
+namespace {
+
+bool InColumns(const Layout& layout) {
+  for (RegionId r = 0; r < layout.size(); ++r) {
+    if (std::isfinite(layout.rect(r).min_z) || std::isfinite(layout.rect(r).max_z)) return false;
+  }
+  return true;
+}
+
+}  // namespace
 
 LayoutDesk::LayoutDesk(const World& world) : world_(world) { state_.now = FirstLayout(world); }
 
@@ -15,6 +29,21 @@ absl::Status LayoutDesk::Resize(int columns, int rows) {
     absl::StatusOr<std::vector<Rect>> cells = EqualCells(world_, columns, rows);
     if (!cells.ok()) return cells;
     return AssignCells(now, *cells, state.leaving);
+  });
+}
+
+absl::Status LayoutDesk::ResizeTo(int regions, const std::vector<double>& weights) {
+  const State before = state();
+  const std::vector<Rect>& homes = before.wanted.empty() ? before.now.regions : before.wanted;
+  if (std::count_if(homes.begin(), homes.end(), [](const Rect& r) { return r.HasArea(); }) == regions) {
+    return absl::OkStatus();
+  }
+  const bool columns = InColumns(world_.layout);
+  int rows = 1;
+  for (int n = 2; !columns && n * n <= regions; ++n) rows = regions % n == 0 ? n : rows;
+  if (weights.empty() || regions < 1 || regions > limits::kMaxRegions) return Resize(regions / rows, rows);
+  return Want([&](const LayoutChange& now, const State& state) -> absl::StatusOr<std::vector<Rect>> {
+    return AssignCells(now, BalancedCells(world_, state.now, weights, regions, columns), state.leaving);
   });
 }
 

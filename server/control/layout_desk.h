@@ -33,6 +33,9 @@ class LayoutDesk {
   // Cells of equal size (EqualCells), and as little as possible changes hands (AssignCells). InvalidArgument names the
   // field; FailedPrecondition: the layout of this world cannot change.
   absl::Status Resize(int columns, int rows);
+  // So many cells, unless there are as many already or will be: columns where the world begins in columns, else as
+  // square as their number allows. Of equal size; with `weights`, by region, of about the same weight (BalancedCells).
+  absl::Status ResizeTo(int regions, const std::vector<double>& weights = {});
   // A neighbour gets the region's area (WithoutArea), and its server leaves.
   absl::Status Drain(RegionId region);
 

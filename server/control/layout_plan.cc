@@ -18,11 +18,6 @@ constexpr double kNarrow = 10;  // m: a world is at least so wide
 
 // The edges of `count` equal parts between these, infinity first and last.
 std::vector<double> Edges(double low, double high, int count) {
-  if (high - low < kNarrow) {
-    const double middle = (low + high) / 2;
-    low = middle - kNarrow / 2;
-    high = middle + kNarrow / 2;
-  }
   std::vector<double> out = {-kInf};
   for (int i = 1; i < count; ++i) out.push_back(low + (high - low) * i / count);
   out.push_back(kInf);
@@ -43,7 +38,31 @@ absl::Status CheckArea(const LayoutChange& now, RegionId region) {
   return absl::InvalidArgumentError(absl::StrCat("region: ", region, " has no area; ask for the layout first"));
 }
 
+// At least kNarrow apart.
+void Widen(double* low, double* high) {
+  const double middle = (*low + *high) / 2;
+  *low = std::min(*low, middle - kNarrow / 2);
+  *high = std::max(*high, middle + kNarrow / 2);
+}
+
 }  // namespace
+
+Rect WhereBodiesBegin(const World& world) {
+  Box all{Vec3::Constant(kInf), Vec3::Constant(-kInf)};
+  const auto include = [&all](const Vec3& min, const Vec3& max) {
+    all.min = all.min.cwiseMin(min);
+    all.max = all.max.cwiseMax(max);
+  };
+  for (const BodySpec& body : world.bodies) include(body.position, body.position);
+  for (const Injector& injector : world.injectors) {
+    for (const Injector::Volume& volume : injector.volumes) include(volume.min, volume.max);
+  }
+  if (all.min.x() > all.max.x()) all = {};
+  Rect out{all.min.x(), all.max.x(), all.min.z(), all.max.z()};
+  Widen(&out.min_x, &out.max_x);
+  Widen(&out.min_z, &out.max_z);
+  return out;
+}
 
 absl::StatusOr<std::vector<Rect>> EqualCells(const World& world, int columns, int rows) {
   if (columns < 1 || rows < 1 || columns > limits::kMaxRegions || rows > limits::kMaxRegions ||
@@ -51,13 +70,8 @@ absl::StatusOr<std::vector<Rect>> EqualCells(const World& world, int columns, in
     return absl::InvalidArgumentError(
         absl::StrCat("columns: ", columns, " times ", rows, " rows must be 1 to ", limits::kMaxRegions, " regions"));
   }
-  Box all{Vec3::Constant(kInf), Vec3::Constant(-kInf)};
-  for (const BodySpec& body : world.bodies) {
-    all.min = all.min.cwiseMin(body.position);
-    all.max = all.max.cwiseMax(body.position);
-  }
-  if (world.bodies.empty()) all = {};
-  const std::vector<double> x = Edges(all.min.x(), all.max.x(), columns), z = Edges(all.min.z(), all.max.z(), rows);
+  const Rect all = WhereBodiesBegin(world);
+  const std::vector<double> x = Edges(all.min_x, all.max_x, columns), z = Edges(all.min_z, all.max_z, rows);
   std::vector<Rect> out;
   for (size_t row = 0; row + 1 < z.size(); ++row) {
     for (size_t column = 0; column + 1 < x.size(); ++column) {

@@ -10,6 +10,9 @@
 
 namespace aureole {
 
+// Around the places where the world's bodies begin, injected ones included; at least 10 m wide each way.
+Rect WhereBodiesBegin(const World& world);
+
 // Cells of equal size, columns along x times rows along z, over the places where the world's bodies begin; the outer
 // ones reach on to infinity. InvalidArgument: fewer than one, or more than limits::kMaxRegions.
 absl::StatusOr<std::vector<Rect>> EqualCells(const World& world, int columns, int rows);

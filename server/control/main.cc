@@ -14,6 +14,7 @@
 #include "server/control/kubernetes/control_process.h"
 #include "server/control/local_allocator.h"
 #include "server/control/run.h"
+#include "server/control/scaling_flags.h"
 #include "server/control/sqlite_store.h"
 #include "server/control/world_file.h"
 #include "server/transport/health_check.h"
@@ -45,6 +46,7 @@ int main(int argc, char** argv) {
   app.add_option("--hash-every", options.hash_every, "Ticks between state hashes; 0 for none")
       ->check(CLI::NonNegativeNumber);
   app.add_flag("--no-real-time", options.no_real_time, "As fast as it can");
+  aureole::AddScalingFlags(&app, &options.scaling);
   app.add_option("--region-server", servers.executable, "Program to start; beside this one when not given");
   app.add_option("--logs", servers.log_directory, "Directory for the servers' logs; kept");
   app.add_option("--data", servers.data_directory, "Directory for checkpoints; beside the logs when not given");
@@ -83,6 +85,10 @@ int main(int argc, char** argv) {
   if (!duration.empty() && (!absl::ParseDuration(duration, &length) || length <= absl::ZeroDuration() ||
                             length == absl::InfiniteDuration())) {
     std::cerr << "--duration: '" << duration << "' is not a time such as 60s, 2m or 500ms\n";
+    return kBadInput;
+  }
+  if (absl::Status s = aureole::CheckScalingFlags(options.scaling, file->world); !s.ok()) {
+    std::cerr << s.message() << '\n';
     return kBadInput;
   }
   options.world = file->spec;

@@ -17,6 +17,7 @@
 #include "server/control/interrupts.h"
 #include "server/control/layout_run.h"
 #include "server/control/reconcile.h"
+#include "server/control/scaling_run.h"
 #include "server/transport/world_spec.h"
 
 namespace aureole {
@@ -109,6 +110,9 @@ class Runner {
     layout_ = std::make_unique<LayoutRun>(
         options_.layouts, regions,
         [this](EventKind kind, RegionId r, const std::string& what) { Tell(kind, r, what); });
+    if (options_.scaling.on()) {
+      scaling_.emplace(options_.scaling, options_.layouts, [this](const std::string& what) { Tell(v1::ControlEvent::SCALED, kNoRegion, what); });
+    }
     record_.set_world_hash(WorldHash(options_.world));
     for (int i = 0; i < regions; ++i) record_.add_regions();
     if (options_.store == nullptr) return absl::OkStatus();
@@ -219,6 +223,7 @@ class Runner {
       RunStatus status = service_->Status();
       status.control = address_;
       TellOfStorage(status);
+      if (scaling_.has_value()) scaling_->Step(status);
       if (absl::Status s = Keep(status); !s.ok()) return s;
       if (absl::Status s = Act(status); !s.ok()) return s;
       const auto now = Clock::now();
@@ -448,6 +453,7 @@ class Runner {
   std::unique_ptr<ControlPlaneService> operators_;
   std::unique_ptr<grpc::Server> server_;  // ends before the services
   std::unique_ptr<LayoutRun> layout_;
+  std::optional<ScalingRun> scaling_;
   std::string address_;
   v1::WorldRecord record_;
   std::vector<RunPlan::Region> plan_regions_;

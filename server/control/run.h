@@ -11,6 +11,7 @@
 #include <absl/status/status.h>
 
 #include "server/control/allocator.h"
+#include "server/control/autoscaler.h"
 #include "server/control/control_hub.h"
 #include "server/control/control_service.h"
 #include "server/control/event_log.h"
@@ -43,7 +44,8 @@ struct RunOptions {
   LayoutDesk* layouts = nullptr;
   // What happens, for those who watch. Null: known only while the run lasts. Outlives the run.
   EventLog* events = nullptr;
-  uint64_t control_epoch = 1;  // grows with each control plane of the world; servers obey no lower one
+  ScalingOptions scaling = {};  // of the layout by the load, when it is on; needs `layouts` of a world that scales
+  uint64_t control_epoch = 1;   // grows with each control plane of the world; servers obey no lower one
   // Once it is true, RunWorld returns and the servers go on without a control plane. Needs a store.
   const std::atomic<bool>* leave = nullptr;
   SecurityOptions security;                // of what listens here; the servers are started with theirs

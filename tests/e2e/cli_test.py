@@ -274,6 +274,19 @@ class Input(Cli):
                             (["--duration", "inf"], "--duration"), (["--hash-every", "-1"], "--hash-every"),
                             (["--frobnicate"], "--frobnicate")):
             self.assertIn(word, self.refused("up", demo, *flags))
+        for flags, word in ((["--regions", "4"], "'4' is not MIN..MAX"), (["--regions", "0..4"], "--regions: min is 0"),
+                            (["--regions", "5..4"], "--regions: min is 5, above max 4"),
+                            (["--regions", "1..65"], "--regions: max is 65"),
+                            (["--regions", "1..4", "--undivided"], "leave out --regions, or --undivided"),
+                            (["--regions", "1..4", "--frame-percent", "0"], "--frame-percent: is 0"),
+                            (["--regions", "1..4", "--awake-bodies", "-1"], "--awake-bodies: is -1"),
+                            (["--regions", "1..4", "--up-after", "soon"], "--up-after"),
+                            (["--regions", "1..4", "--down-after", "1s"], "--down-after: must be a time from upAfter"),
+                            (["--awake-bodies", "10"], "--regions")):
+            self.assertIn(word, self.refused("up", demo, *flags))
+        delayed = self.path / "delayed.json"
+        delayed.write_text(json.dumps({**json.loads(demo.read_text()), "exchange": {"delay": 1}}))
+        self.assertIn("--regions: from 1 to 4 needs a layout that can change", self.refused("up", delayed, "--regions", "1..4"))
         self.assertIn("--repeat", self.refused("experiment", demo, "--repeat", "0"))
         self.assertIn("--policies", self.refused("experiment"))
         self.assertIn("--policies", self.refused("experiment", demo, "--policies"))

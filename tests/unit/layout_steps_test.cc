@@ -1,9 +1,13 @@
 // The steps of the control plane from one layout to another, and the cells that operators' wishes mean.
 #include <gtest/gtest.h>
 
+#include <algorithm>
+#include <cmath>
 #include <limits>
 
+#include "server/control/balanced_cells.h"
 #include "server/control/layout_change.h"
+#include "server/control/layout_desk.h"
 #include "server/control/layout_plan.h"
 #include "server/core/limits.h"
 #include "server/core/partition.h"
@@ -132,6 +136,86 @@ TEST(LayoutPlan, EqualCellsTileThePlane) {
   EXPECT_EQ(EqualCells(world, 1, 1)->front(), kAll);
   EXPECT_FALSE(EqualCells(world, 0, 1).ok());
   EXPECT_FALSE(EqualCells(world, 10, 10).ok());
+}
+
+TEST(LayoutPlan, InjectedBodiesBeginInTheirVolumes) {
+  World world = Square();
+  Injector injector;
+  injector.volumes.push_back({{-50, 0, 3}, {-40, 5, 4}});
+  world.injectors.push_back(injector);
+  EXPECT_EQ(WhereBodiesBegin(world), (Rect{-50, 12, -12, 12}));
+  world.bodies.clear();
+  EXPECT_EQ(WhereBodiesBegin(world), (Rect{-50, -40, -1.5, 8.5}));
+  world.injectors.clear();
+  EXPECT_EQ(WhereBodiesBegin(world), (Rect{-5, 5, -5, 5}));
+}
+
+TEST(BalancedCells, TileThePlaneForEveryCount) {
+  const World world = Square();
+  for (const bool columns : {true, false}) {
+    for (const std::vector<double>& weights : {std::vector<double>{}, {0, 0}, {1, 0}, {3, 1e9}}) {
+      for (int count = 1; count <= 64; ++count) {
+        const std::vector<Rect> cells = BalancedCells(world, Two().now, weights, count, columns);
+        ASSERT_EQ(cells.size(), static_cast<size_t>(count));
+        EXPECT_TRUE(Layout::Rectangles(cells).ok()) << count;
+        for (const Rect& r : cells) EXPECT_TRUE(!columns || std::isinf(r.min_z));
+      }
+    }
+  }
+}
+
+TEST(BalancedCells, WithoutWeightsTheyAreOfEqualSize) {
+  const std::vector<Rect> cells = BalancedCells(Square(), Two().now, {}, 4, false);
+  EXPECT_NEAR(cells[0].max_x, 0, 1e-6);
+  EXPECT_NEAR(cells[0].max_z, 0, 1e-6);
+  EXPECT_NEAR(BalancedCells(Square(), Two().now, {}, 3, true)[0].max_x, -4, 1e-6);
+}
+
+// Where all is in a small place, changes of the layout find it: each sees more.
+TEST(BalancedCells, CloseInOnACrowd) {
+  const World world = Square();
+  LayoutChange now = FirstLayout(world);
+  const auto crowd = [](const Rect& r) {  // evenly in 3 m by 3 m
+    const double x = std::min(r.max_x, 9.0) - std::max(r.min_x, 6.0),
+                 z = std::min(r.max_z, 9.0) - std::max(r.min_z, 6.0);
+    return x > 0 && z > 0 ? 100 * x * z / 9 : 0.0;
+  };
+  double busiest = 0;
+  for (const int count : {2, 4, 5, 6, 7, 8}) {
+    std::vector<double> weights;
+    for (const Rect& r : now.regions) weights.push_back(crowd(r));
+    const std::vector<Rect> cells = BalancedCells(world, now, weights, count, false);
+    now.regions = AssignCells(now, cells);
+    busiest = 0;
+    for (const Rect& r : now.regions) busiest = std::max(busiest, crowd(r));
+  }
+  EXPECT_LT(busiest, 50);
+  busiest = 0;
+  const std::vector<Rect> equal = *EqualCells(world, 4, 2);
+  for (const Rect& r : equal) busiest = std::max(busiest, crowd(r));
+  EXPECT_EQ(busiest, 100) << "cells of equal size do not help";
+}
+
+TEST(LayoutDesk, ResizesToColumnsOrToCellsAsTheWorldBegan) {
+  World world = Square();
+  LayoutDesk columns(world);
+  EXPECT_TRUE(columns.ResizeTo(4).ok());
+  EXPECT_EQ(columns.wanted(), *EqualCells(world, 4, 1));
+  EXPECT_TRUE(columns.ResizeTo(3, {1}).ok());
+  const std::vector<Rect> three = columns.wanted();
+  for (const Rect& r : three) EXPECT_TRUE(!r.HasArea() || std::isinf(r.min_z));
+  const std::vector<double> edge = {0};
+  world.layout = *Layout::Grid(edge, edge);
+  LayoutDesk grid(world);
+  EXPECT_TRUE(grid.ResizeTo(4).ok());
+  EXPECT_TRUE(grid.wanted().empty()) << "there are as many";
+  EXPECT_TRUE(grid.ResizeTo(6).ok());
+  const std::vector<Rect> six = grid.wanted();
+  EXPECT_EQ(std::count_if(six.begin(), six.end(), [](const Rect& r) { return r.max_z <= 0; }), 3);
+  EXPECT_TRUE(absl::IsInvalidArgument(grid.ResizeTo(0)));
+  EXPECT_TRUE(absl::IsInvalidArgument(grid.ResizeTo(65, {1})));
+  world.exchange.k = 1;
+  EXPECT_TRUE(absl::IsFailedPrecondition(grid.ResizeTo(5, {1})));
 }
 
 TEST(LayoutPlan, CellsGoToThoseThatHaveMostOfThem) {
