@@ -474,6 +474,54 @@ TEST_F(WorldLife, ScaledWorldGetsAndLosesServersAndNoBitChanges) {
   ExpectEndAsUndisturbed();
 }
 
+// Its bodies fall at once and sleep soon after, until one is struck.
+TEST_F(WorldLife, WorldScalesItselfByItsLoadAndNoBitChanges) {
+  cluster_.StartControl(0);
+  Json spec = Spec();
+  spec["regions"] = {{"min", 2},          {"max", 5},           {"framePercent", 1000},
+                     {"awakeBodies", 50}, {"upAfter", "300ms"}, {"downAfter", "1s"}};
+  Create(spec);
+  const auto replicas = [this] { return IntegerAt(cluster_.World("w"), {"spec", "replicas"}).value_or(0); };
+  // It has none at first.
+  ASSERT_TRUE(Await([&] { return replicas() > 2; })) << Status().dump(1);
+  ASSERT_TRUE(Await([&] { return IntegerAt(Status(), {"replicas"}) == replicas() && replicas() > 2; }));
+  EXPECT_TRUE(Await([&] { return HasEvent("Scaled"); }));
+  EXPECT_EQ(Condition("Applied", "status"), "True");
+  ExpectEndAsUndisturbed();
+  EXPECT_LE(replicas(), 5);
+}
+
+TEST_F(WorldLife, IdleWorldShrinksToItsLeastAndAWishLastsForATime) {
+  cluster_.StartControl(0);
+  cluster_.api().Inject({.kind = Fault::Kind::kStatus, .method = "PATCH", .target = "/worlds/w/scale", .status = 403});
+  Json spec = Spec();
+  spec.erase("duration");
+  spec["replicas"] = 12;  // too many
+  spec["regions"] = {{"min", 1},
+                     {"max", 3},
+                     {"framePercent", 1000},
+                     {"awakeBodies", 1000000},
+                     {"upAfter", "200ms"},
+                     {"downAfter", "1500ms"}};
+  Create(spec);
+  const auto is = [this](int regions) {  // and the next control plane would know of those that have left
+    return Find(Status(), {"record", "leaving"}) == nullptr &&
+           IntegerAt(cluster_.World("w"), {"spec", "replicas"}) == regions &&
+           TextAt(Status(), {"regionsReady"}) == absl::StrCat(regions, "/", regions) &&
+           cluster_.processes() == static_cast<size_t>(regions);
+  };
+  ASSERT_TRUE(Await([&] { return is(1); })) << Status().dump(1);
+  EXPECT_TRUE(Await([&] { return HasEvent("CannotScale"); }));
+  cluster_.api().Merge(absl::StrCat(kWorlds, "w"), {{"spec", {{"replicas", 3}}}});
+  ASSERT_TRUE(Await([&] { return is(3); })) << Status().dump(1);
+  ASSERT_TRUE(Await([&] { return is(1); })) << Status().dump(1);
+  // The next control plane goes on from there, and with other bounds.
+  cluster_.SignalControl(0, SIGKILL);
+  cluster_.StartControl(1);
+  cluster_.api().Merge(absl::StrCat(kWorlds, "w"), {{"spec", {{"regions", {{"min", 2}}}}}});
+  ASSERT_TRUE(Await([&] { return is(2); })) << Status().dump(1);
+}
+
 TEST_F(WorldLife, WorldsOfOneControlPlaneDoNotMix) {
   cluster_.StartControl(0);
   Json spec = Spec();

@@ -134,7 +134,16 @@ TEST(WorldResource, RefusalsNameTheFieldAndChangeNothing) {
       {"/checkpointSeconds", "1s", "spec.checkpointSeconds: must be above 0"},
       {"/policy", "GoOn", "spec.policy: is GoOn; only Wait is possible"},
       {"/replicas", 65, "spec.replicas: is 65; regions allows 1 to 64"},
-      {"/regions", {{"min", 5}, {"max", 4}}, "spec.regions: min 5 is above max 4"},
+      {"/regions", {{"min", 5}, {"max", 4}}, "spec.regions.min: is 5, above max 4; exchange them"},
+      {"/regions", {{"min", 0}, {"max", 4}}, "spec.regions.min: is 0; must be 1 to 64 regions"},
+      {"/regions", {{"max", 65}}, "spec.regions.max: is 65; must be 1 to 64 regions"},
+      {"/regions", {{"max", "many"}}, "spec.regions.max: is -1; must be 1 to 64 regions"},
+      {"/regions", {{"max", 8}, {"framePercent", 0}}, "spec.regions.framePercent: is 0; must be 1 to 1000 percent"},
+      {"/regions", {{"max", 8}, {"awakeBodies", -3}}, "spec.regions.awakeBodies: is -1; must be 1 to 1000000"},
+      {"/regions", {{"max", 8}, {"upAfter", "soon"}}, "spec.regions.upAfter: must be a time such as \"5s\""},
+      {"/regions", {{"max", 8}, {"upAfter", "1ms"}}, "spec.regions.upAfter: must be a time of 100ms to 24h"},
+      {"/regions", {{"max", 8}, {"downAfter", "1s"}}, "spec.regions.downAfter: must be a time from upAfter"},
+      {"/regions", {{"min", 5}}, "spec.replicas: is 4, as the layout has regions; regions allows 5 to 64"},
   };
   for (const auto& tested : cases) {
     Json object = World();
@@ -147,6 +156,53 @@ TEST(WorldResource, RefusalsNameTheFieldAndChangeNothing) {
     EXPECT_TRUE(absl::IsInvalidArgument(s)) << tested.field << ": " << s;
     EXPECT_TRUE(absl::StartsWith(s.message(), tested.message)) << s;
   }
+}
+
+TEST(WorldResource, ScalesItselfWhereAMaxIsAboveMin) {
+  Json object = World();
+  EXPECT_FALSE(Read(object).scaling.on());
+  for (const Json& fixed : {Json{{"min", 1}}, Json{{"min", 4}, {"max", 4}}}) {
+    object["spec"]["regions"] = fixed;
+    EXPECT_FALSE(Read(object).scaling.on()) << fixed;
+  }
+  object["spec"]["regions"] = {{"max", 8}};
+  ScalingOptions expected;
+  expected.min_regions = 1;
+  expected.max_regions = 8;
+  EXPECT_EQ(Read(object).scaling, expected);
+  object["spec"]["regions"] = {{"min", 2},           {"max", 8},        {"framePercent", 50},
+                               {"awakeBodies", 300}, {"upAfter", "1s"}, {"downAfter", "10m"}};
+  expected = {2, 8, 50, 300, std::chrono::seconds(1), std::chrono::minutes(10)};
+  EXPECT_EQ(Read(object).scaling, expected);
+}
+
+TEST(WorldResource, ReplicasOutOfBoundsAreBroughtIntoThemWhereItScalesItself) {
+  const struct {
+    int min, max, given, replicas;
+  } cases[] = {{1, 8, 0, 4}, {5, 8, 0, 5}, {1, 3, 0, 3}, {1, 8, 6, 6}, {1, 8, 9, 8}, {3, 8, 2, 3}};
+  for (const auto& tested : cases) {
+    Json object = World();
+    object["spec"]["regions"] = {{"min", tested.min}, {"max", tested.max}};
+    if (tested.given != 0) object["spec"]["replicas"] = tested.given;
+    EXPECT_EQ(Read(object).replicas, tested.replicas);
+    EXPECT_EQ(Read(object).replicas_given, tested.given);
+  }
+  Json object = World();
+  object["spec"]["regions"] = {{"min", 3}, {"max", 3}};
+  object["spec"]["replicas"] = 2;
+  EXPECT_EQ(ReadWorld(object, std::nullopt, kDefaults).status().message(),
+            "spec.replicas: is 2; regions allows 3 to 3");
+}
+
+TEST(WorldResource, AWorldWithADelayDoesNotScaleItself) {
+  Json object = World();
+  object["spec"]["world"]["exchange"] = {{"delay", 1}};
+  object["spec"]["regions"] = {{"min", 2}, {"max", 8}};
+  const absl::Status s = ReadWorld(object, std::nullopt, kDefaults).status();
+  EXPECT_TRUE(absl::StartsWith(s.message(), "spec.regions: from 2 to 8 needs a layout that can change")) << s;
+  EXPECT_TRUE(absl::StrContains(s.message(), "set exchange.delay to 0")) << s;
+  object["spec"]["regions"] = {{"min", 4}, {"max", 4}};
+  EXPECT_EQ(Read(object).replicas, 4);
 }
 
 TEST(WorldResource, OtherRefusalsNameThePlace) {

@@ -106,14 +106,62 @@ absl::Status ReadPods(const Json& spec, const PodDefaults& defaults, PodTemplate
   return absl::OkStatus();
 }
 
-absl::StatusOr<int> ReadReplicas(const Json& spec, int regions) {
-  const int64_t least = IntegerAt(spec, {"regions", "min"}).value_or(1),
-                most = IntegerAt(spec, {"regions", "max"}).value_or(limits::kMaxRegions);
-  if (least > most) return Refuse("regions", absl::StrFormat("min %d is above max %d", least, most));
-  const int64_t wanted = IntegerAt(spec, {"replicas"}).value_or(regions);
-  if (wanted >= least && wanted <= most && wanted <= limits::kMaxRegions) return static_cast<int>(wanted);
-  return Refuse("replicas", absl::StrFormat("is %d; regions allows %d to %d", wanted, least,
-                                            std::min<int64_t>(most, limits::kMaxRegions)));
+absl::Status ReadTime(const Json& regions, const char* field, std::chrono::milliseconds* out) {
+  if (Find(regions, {field}) == nullptr) return absl::OkStatus();
+  absl::Duration time;
+  if (!absl::ParseDuration(TextAt(regions, {field}), &time)) {
+    return Refuse(absl::StrCat("regions.", field), "must be a time such as \"5s\" or \"2m\"");
+  }
+  *out = absl::ToChronoMilliseconds(time);
+  return absl::OkStatus();
+}
+
+// A number that an int holds; what is none, or too small, is -1.
+int NumberAt(const Json& regions, const char* field, int otherwise) {
+  if (Find(regions, {field}) == nullptr) return otherwise;
+  return static_cast<int>(std::clamp<int64_t>(IntegerAt(regions, {field}).value_or(-1), -1, 1 << 30));
+}
+
+// spec.regions, all of it, also where the world does not scale itself.
+absl::StatusOr<ScalingOptions> ReadScaling(const Json& spec) {
+  ScalingOptions out;
+  out.min_regions = 1;
+  out.max_regions = limits::kMaxRegions;
+  const Json* const regions = Find(spec, {"regions"});
+  if (regions == nullptr) return out;
+  out.min_regions = NumberAt(*regions, "min", out.min_regions);
+  out.max_regions = NumberAt(*regions, "max", out.max_regions);
+  out.frame_percent = NumberAt(*regions, "framePercent", out.frame_percent);
+  out.awake_bodies = NumberAt(*regions, "awakeBodies", 0);
+  if (absl::Status s = ReadTime(*regions, "upAfter", &out.up_after); !s.ok()) return s;
+  if (absl::Status s = ReadTime(*regions, "downAfter", &out.down_after); !s.ok()) return s;
+  if (absl::Status s = CheckScaling(out); !s.ok()) return InWorld("spec.regions.", s);
+  return out;
+}
+
+absl::Status ReadReplicas(const Json& spec, const World& world, WorldResource* out) {
+  const absl::StatusOr<ScalingOptions> scaling = ReadScaling(spec);
+  if (!scaling.ok()) return scaling.status();
+  const int least = scaling->min_regions, most = scaling->max_regions;
+  // Bounds alone, without a max, are for people.
+  if (Find(spec, {"regions", "max"}) != nullptr && least < most) {
+    if (absl::Status s = CheckScales(*scaling, world); !s.ok()) return Refuse("regions", std::string(s.message()));
+    out->scaling = *scaling;
+  }
+  int64_t wanted = world.layout.size();
+  if (Find(spec, {"replicas"}) != nullptr) {
+    wanted = IntegerAt(spec, {"replicas"}).value_or(0);
+    if (wanted < 1 || wanted > limits::kMaxRegions || (!out->scaling.on() && (wanted < least || wanted > most))) {
+      return Refuse("replicas", absl::StrFormat("is %d; regions allows %d to %d", wanted, least, most));
+    }
+    out->replicas_given = static_cast<int>(wanted);
+  } else if (!out->scaling.on() && (wanted < least || wanted > most)) {
+    return Refuse("replicas",
+                  absl::StrFormat("is %d, as the layout has regions; regions allows %d to %d", wanted, least, most));
+  }
+  wanted = std::clamp<int64_t>(wanted, least, most);
+  out->replicas = static_cast<int>(wanted);
+  return absl::OkStatus();
 }
 
 }  // namespace
@@ -180,9 +228,7 @@ absl::StatusOr<WorldResource> ReadWorld(const Json& object, const std::optional<
   if (absl::Status s = ReadRun(*spec, checked->environment.tick_us, &out.run); !s.ok()) return s;
   if (absl::Status s = ReadStorage(*spec, &out.pods.storage); !s.ok()) return s;
   if (absl::Status s = ReadPods(*spec, defaults, &out.pods); !s.ok()) return s;
-  const absl::StatusOr<int> replicas = ReadReplicas(*spec, out.run.regions);
-  if (!replicas.ok()) return replicas.status();
-  out.replicas = *replicas;
+  if (absl::Status s = ReadReplicas(*spec, *checked, &out); !s.ok()) return s;
   out.fixed = Json::object();
   for (const char* field : kFixed) {
     if (const Json* const value = Find(*spec, {field}); value != nullptr) out.fixed[field] = *value;

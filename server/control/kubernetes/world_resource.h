@@ -40,6 +40,8 @@ struct WorldResource {
   PodTemplate pods;         // may change while the world runs, for the Pods to come; not its storage
   std::vector<Rect> homes;  // by region, in the layout with which the world begins
   int replicas = 0;         // wanted number of regions
+  int replicas_given = 0;   // as the World has it, which may be out of its bounds where it scales itself; 0: not at all
+  ScalingOptions scaling;   // on, where the world scales itself
   Json fixed;               // what cannot change while the world runs, but for the world itself
   std::string world_hash;   // of the world itself, in hex
 };

@@ -1,7 +1,6 @@
 #include "server/control/kubernetes/world_runner.h"
 
 #include <algorithm>
-#include <cmath>
 #include <utility>
 
 #include <absl/strings/str_cat.h>
@@ -10,7 +9,9 @@
 
 #include "server/control/kubernetes/backoff.h"
 #include "server/control/kubernetes/replicas_writer.h"
+#include "server/control/kubernetes/world_scaler.h"
 #include "server/control/layout_desk.h"
+#include "server/control/scaling_run.h"
 #include "server/transport/world_spec.h"
 
 namespace aureole::kubernetes {
@@ -49,23 +50,6 @@ std::string Differences(const WorldResource& runs, const WorldResource& wanted) 
   return absl::StrCat(absl::StrJoin(fields, ", "),
                       ": cannot change while the world runs; it goes on as it began. Change it back, or delete the "
                       "World and make it anew");
-}
-
-// As many regions as are wanted: columns where the world is in columns, else cells that are as square as their number
-// allows.
-absl::Status Scale(int replicas, LayoutDesk* desk) {
-  const LayoutDesk::State state = desk->state();
-  const std::vector<Rect>& homes = state.wanted.empty() ? state.now.regions : state.wanted;
-  if (std::count_if(homes.begin(), homes.end(), [](const Rect& r) { return r.HasArea(); }) == replicas) {
-    return absl::OkStatus();
-  }
-  const Layout& begins = desk->world().layout;
-  bool columns = true;
-  for (RegionId r = 0; r < begins.size(); ++r)
-    columns &= std::isinf(begins.rect(r).min_z) && std::isinf(begins.rect(r).max_z);
-  int rows = 1;
-  for (int n = 2; !columns && n * n <= replicas; ++n) rows = replicas % n == 0 ? n : rows;
-  return desk->Resize(replicas / rows, rows);
 }
 
 }  // namespace
@@ -247,21 +231,26 @@ WorldRunner::Next WorldRunner::RunOnce(WorldResource world) {
     store_.Publish(status);
   };
   ReplicasWriter replicas(context_->client, space_, name_, kReplicasAgain);
+  WorldScaler scaler(
+      context_->client, &desk, context_->leads,
+      [this](bool warning, const std::string& reason, const std::string& message) { Tell(warning, reason, message); });
   const auto observe = [&](const RunStatus& now) {
     if (const Object latest = Latest(); GenerationOf(*latest) != looked_at) {
       looked_at = GenerationOf(*latest);
       not_applied = Change(*latest, &world);
-      if (absl::Status s = Scale(world.replicas, &desk); !s.ok() && not_applied.empty()) {
+      if (absl::Status s = desk.ResizeTo(world.replicas, world.scaling.on() ? WeightsOf(now) : std::vector<double>());
+          !s.ok() && not_applied.empty()) {
         not_applied = absl::StrCat("spec.replicas: ", s.message());
       }
       allocator.Use(world.pods);
       if (!not_applied.empty()) Tell(true, "CannotChange", not_applied);
     }
-    if (context_->leads() && !stopping_) {
+    if (!world.scaling.on() && context_->leads() && !stopping_) {
       if (absl::Status s = replicas.Look(*Latest(), world.replicas); !s.ok()) {
         Tell(true, "CannotScale", absl::StrCat("spec.replicas: cannot be written: ", std::string(s.message())));
       }
     }
+    scaler.Look(world, now);
     if (Clock::now() >= next_publish || now.stage != stage) {
       next_publish = Clock::now() + kPublishEvery;
       stage = now.stage;
@@ -299,6 +288,8 @@ std::string WorldRunner::Change(const Json& object, WorldResource* world) {
   world->pods = wanted->pods;
   world->pods.storage = storage;
   world->replicas = wanted->replicas;
+  world->replicas_given = wanted->replicas_given;
+  world->scaling = wanted->scaling;
   return Differences(*world, *wanted);
 }
 
