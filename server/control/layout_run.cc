@@ -269,8 +269,9 @@ void LayoutRun::Adopt() {
 void LayoutRun::Drop() {
   const std::string why = withdrawn_ ? "a region that was to join has not come in time" : outcome_->refused();
   if (refused_ != why) {
-    tell_(v1::ControlEvent::LAYOUT_REFUSED, kNoRegion,
-          absl::StrCat("the layout of epoch ", proposed_->epoch, withdrawn_ ? " is given up: " : " was refused: ", why));
+    tell_(
+        v1::ControlEvent::LAYOUT_REFUSED, kNoRegion,
+        absl::StrCat("the layout of epoch ", proposed_->epoch, withdrawn_ ? " is given up: " : " was refused: ", why));
   }
   refused_ = why;
   for (RegionId r : proposed_->members) {

@@ -111,7 +111,8 @@ class Runner {
         options_.layouts, regions,
         [this](EventKind kind, RegionId r, const std::string& what) { Tell(kind, r, what); });
     if (options_.scaling.on()) {
-      scaling_.emplace(options_.scaling, options_.layouts, [this](const std::string& what) { Tell(v1::ControlEvent::SCALED, kNoRegion, what); });
+      scaling_.emplace(options_.scaling, options_.layouts,
+                       [this](const std::string& what) { Tell(v1::ControlEvent::SCALED, kNoRegion, what); });
     }
     record_.set_world_hash(WorldHash(options_.world));
     for (int i = 0; i < regions; ++i) record_.add_regions();
