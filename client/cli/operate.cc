@@ -32,16 +32,24 @@ std::unique_ptr<Stub> Reach(const OperateOptions& o) {
 int Say(const grpc::Status& s) {
   if (s.ok()) return kExitOk;
   std::cerr << s.error_message() << '\n';
-  const bool wrong =
-      s.error_code() == grpc::StatusCode::INVALID_ARGUMENT || s.error_code() == grpc::StatusCode::FAILED_PRECONDITION;
+  const bool wrong = s.error_code() == grpc::StatusCode::INVALID_ARGUMENT ||
+                     s.error_code() == grpc::StatusCode::FAILED_PRECONDITION ||
+                     s.error_code() == grpc::StatusCode::NOT_FOUND;
   return wrong ? kExitBadInput : kExitFailed;
 }
 
+// Which of a control plane's worlds the call is about.
+void NameWorld(const OperateOptions& o, grpc::ClientContext* context) {
+  if (!o.world.empty()) context->AddMetadata("aureole-world", o.world);
+}
+
 template <class Request, class Response>
-int Call(Stub* stub, grpc::Status (Stub::*method)(grpc::ClientContext*, const Request&, Response*),
-         const Request& request, Response* response) {
+int Call(const OperateOptions& o, Stub* stub,
+         grpc::Status (Stub::*method)(grpc::ClientContext*, const Request&, Response*), const Request& request,
+         Response* response) {
   grpc::ClientContext context;
   context.set_deadline(std::chrono::system_clock::now() + kPatience);
+  NameWorld(o, &context);
   return Say((stub->*method)(&context, request, response));
 }
 
@@ -87,7 +95,7 @@ int Await(Stub* stub, const OperateOptions& o) {
   const auto until = std::chrono::steady_clock::now() + std::chrono::duration<double>(o.wait_s);
   for (;;) {
     v1::ControlledWorld world;
-    if (const int code = Call(stub, &Stub::GetWorld, v1::GetControlledWorldRequest(), &world); code != kExitOk) {
+    if (const int code = Call(o, stub, &Stub::GetWorld, v1::GetControlledWorldRequest(), &world); code != kExitOk) {
       return code;
     }
     const bool over = std::chrono::steady_clock::now() >= until;
@@ -105,6 +113,7 @@ void AddControl(CLI::App* c, OperateOptions* o) {
                 "The world's control plane: --listen of aureole-control, --control of aureole up")
       ->required()
       ->type_name("HOST:PORT");
+  c->add_option("--world", o->world, "Which of its worlds, where it has several: the name of the World on Kubernetes");
   c->add_flag("--json", o->json, "One JSON object");
   AddAccess(c);
 }
@@ -155,7 +164,7 @@ CLI::App* AddDrain(CLI::App& app, OperateOptions* o) {
 
 int RunWorldCommand(const OperateOptions& o) {
   v1::ControlledWorld world;
-  const int code = Call(Reach(o).get(), &Stub::GetWorld, v1::GetControlledWorldRequest(), &world);
+  const int code = Call(o, Reach(o).get(), &Stub::GetWorld, v1::GetControlledWorldRequest(), &world);
   if (code == kExitOk) Print(world, o.json);
   return code;
 }
@@ -171,6 +180,7 @@ int RunEvents(const OperateOptions& o) {
     const auto begun = Clock::now();
     bool heard = false;
     grpc::ClientContext context;
+    NameWorld(o, &context);
     if (!o.follow) context.set_deadline(std::chrono::system_clock::now() + kPatience);
     const std::jthread interrupted([&context](const std::stop_token& stop) {
       while (!stop.stop_requested() && Interrupts() == 0) std::this_thread::sleep_for(kLookEvery);
@@ -198,7 +208,7 @@ int RunResize(const OperateOptions& o) {
   request.set_columns(o.columns);
   request.set_rows(o.rows);
   v1::ResizeLayoutResponse response;
-  const int code = Call(stub.get(), &Stub::ResizeLayout, request, &response);
+  const int code = Call(o, stub.get(), &Stub::ResizeLayout, request, &response);
   return code == kExitOk ? Await(stub.get(), o) : code;
 }
 
@@ -207,7 +217,7 @@ int RunDrain(const OperateOptions& o) {
   v1::DrainRegionRequest request;
   request.set_region(o.region);
   v1::DrainRegionResponse response;
-  const int code = Call(stub.get(), &Stub::DrainRegion, request, &response);
+  const int code = Call(o, stub.get(), &Stub::DrainRegion, request, &response);
   return code == kExitOk ? Await(stub.get(), o) : code;
 }
 

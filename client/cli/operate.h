@@ -10,7 +10,7 @@
 namespace aureole {
 
 struct OperateOptions {
-  std::string control;
+  std::string control, world;
   int columns = 1, rows = 1;
   int region = 0;
   double wait_s = 60;

@@ -177,15 +177,20 @@ class Runner {
     plan.checkpoint_every = options_.checkpoint_every;
     service_ = std::make_unique<ControlService>(plan);
     layout_->Serve(service_.get());
+    if (options_.layouts != nullptr) {
+      operators_ = std::make_unique<ControlPlaneService>(*options_.layouts, events(),
+                                                         [service = service_.get()] { return service->Status(); });
+    }
     if (options_.hub != nullptr) {
-      options_.hub->Add(options_.world_name, service_.get());
+      options_.hub->Add(options_.world_name, {service_.get(), operators_.get(),
+                                              options_.layouts == nullptr ? "" : options_.layouts->world().name});
       address_ = options_.advertise;
       return absl::OkStatus();
     }
     absl::StatusOr<std::unique_ptr<Security>> security = Security::Open(options_.security);
     if (!security.ok()) return security.status();
     security_ = *std::move(security);
-    if (absl::Status s = security_->CheckListen(options_.listen, false); !s.ok()) return s;
+    if (absl::Status s = security_->CheckListen(options_.listen, operators_ != nullptr); !s.ok()) return s;
     grpc::ServerBuilder builder;
     ConfigureControlPort(&builder);
     int port = 0;
@@ -194,9 +199,7 @@ class Runner {
     const std::string listen = any ? record_.control() : options_.listen;
     security_->Listen(&builder, listen, &port);
     security_->guard().Register(&builder, v1::Control::service_full_name(), service_.get());
-    if (options_.layouts != nullptr) {
-      operators_ = std::make_unique<ControlPlaneService>(*options_.layouts, events(),
-                                                         [service = service_.get()] { return service->Status(); });
+    if (operators_ != nullptr) {
       security_->guard().Register(&builder, v1::ControlPlane::service_full_name(), operators_.get());
       security_->guard().ServeWorld(options_.layouts->world().name);
     }

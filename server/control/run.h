@@ -34,7 +34,8 @@ struct RunOptions {
   // bit; 0: the run ends with the first server that does.
   Tick checkpoint_every = 0;
   std::string listen = "127.0.0.1:0";
-  // Servers join at this hub's port instead, which they dial at `advertise`, host:port, with `world_name`.
+  // Servers join, and operators call, at this hub's port instead, which servers dial at `advertise`, host:port, with
+  // `world_name`.
   ControlHub* hub = nullptr;
   std::string advertise = {}, world_name = {};
   // Kept there, the run outlives this control plane: the one that calls RunWorld next with the same store and world

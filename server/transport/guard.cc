@@ -190,8 +190,15 @@ void Guard::Register(grpc::ServerBuilder* builder, const char* full_name, grpc::
 }
 
 void Guard::ServeWorld(const std::string& world) {
+  ServeWorlds([world](const grpc::ServerContextBase&, const std::string&, std::string* out) {
+    *out = world;
+    return grpc::Status::OK;
+  });
+}
+
+void Guard::ServeWorlds(WorldOf world_of) {
   const std::lock_guard lock(mutex_);
-  world_ = world;
+  world_of_ = std::move(world_of);
 }
 
 grpc::Status Guard::Admit(const Access& access, const grpc::ServerContextBase& context, Rights* rights) {
@@ -202,7 +209,7 @@ grpc::Status Guard::Admit(const Access& access, const grpc::ServerContextBase& c
     return Refusal(grpc::StatusCode::UNAUTHENTICATED, v1::NO_TOKEN, "authorization",
                    "must be in the metadata of every call, once, as \"Bearer TOKEN\"");
   }
-  return AdmitToken(access.right, tokens[0], rights);
+  return AdmitToken(access.right, tokens[0], context, rights);
 }
 
 // Servers have no tokens: who says one is a client, even where servers have no certificates.
@@ -218,7 +225,8 @@ grpc::Status Guard::AdmitServer(const grpc::ServerContextBase& context) const {
                  absl::StrCat("only servers may call this, by a certificate of this server's authority: ", why));
 }
 
-grpc::Status Guard::AdmitToken(v1::Token::Right right, const std::string& token, Rights* rights) {
+grpc::Status Guard::AdmitToken(v1::Token::Right right, const std::string& token, const grpc::ServerContextBase& context,
+                               Rights* rights) {
   const std::optional<v1::Token> entry = tokens_->Find(token);
   if (!entry.has_value()) {
     return Refusal(grpc::StatusCode::UNAUTHENTICATED, v1::TOKEN_UNKNOWN, "authorization",
@@ -228,14 +236,18 @@ grpc::Status Guard::AdmitToken(v1::Token::Right right, const std::string& token,
     return Refusal(grpc::StatusCode::UNAUTHENTICATED, v1::TOKEN_EXPIRED, "authorization",
                    "is over; ask for another token");
   }
+  WorldOf world_of;
   {
     const std::lock_guard lock(mutex_);
-    if (world_.empty()) return NoRegion();
-    if (entry->world() != world_) {
-      return Refusal(
-          grpc::StatusCode::PERMISSION_DENIED, v1::WRONG_WORLD, "authorization",
-          absl::StrCat("is for the world ", entry->world(), ", this is ", world_, "; use a token of this world"));
-    }
+    world_of = world_of_;
+  }
+  if (world_of == nullptr) return NoRegion();
+  std::string world;
+  if (grpc::Status s = world_of(context, entry->world(), &world); !s.ok()) return s;
+  if (entry->world() != world) {
+    return Refusal(
+        grpc::StatusCode::PERMISSION_DENIED, v1::WRONG_WORLD, "authorization",
+        absl::StrCat("is for the world ", entry->world(), ", this is ", world, "; use a token of this world"));
   }
   *rights = Rights(*entry);
   return rights->Has(right) ? grpc::Status::OK : NoRight("", right);

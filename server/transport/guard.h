@@ -5,6 +5,7 @@
 // the services but their methods, each behind a door.
 #pragma once
 
+#include <functional>
 #include <map>
 #include <memory>
 #include <mutex>
@@ -62,6 +63,11 @@ class Guard {
   void Register(grpc::ServerBuilder* builder, const char* full_name, grpc::Service* service);
   // The world that tokens must be for. Until it is known they open nothing (UNAVAILABLE).
   void ServeWorld(const std::string& world);
+  // Where several worlds are served: which one a call is for, or its refusal. `known`: the world that the caller's
+  // token is for; of others he need not hear. Any thread.
+  using WorldOf =
+      std::function<grpc::Status(const grpc::ServerContextBase& context, const std::string& known, std::string* world)>;
+  void ServeWorlds(WorldOf world_of);
 
   // Whether the call may go on; if so, `rights` are the caller's. The refusals are those of proto/README.md.
   grpc::Status Admit(const Access& access, const grpc::ServerContextBase& context, Rights* rights);
@@ -70,13 +76,14 @@ class Guard {
   class Service;
 
   grpc::Status AdmitServer(const grpc::ServerContextBase& context) const;
-  grpc::Status AdmitToken(v1::Token::Right right, const std::string& token, Rights* rights);
+  grpc::Status AdmitToken(v1::Token::Right right, const std::string& token, const grpc::ServerContextBase& context,
+                          Rights* rights);
 
   const std::string authorities_;
   const std::unique_ptr<TokenFile> tokens_;
   std::vector<std::unique_ptr<grpc::Service>> services_;
   std::mutex mutex_;
-  std::string world_;  // empty: not known yet
+  WorldOf world_of_;  // null: not known yet
 };
 
 }  // namespace aureole

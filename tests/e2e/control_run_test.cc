@@ -8,6 +8,7 @@
 #include <mutex>
 #include <thread>
 
+#include "server/control/control_plane_service.h"
 #include "server/transport/world_spec.h"
 #include "tests/e2e/fake_region.h"
 
@@ -328,14 +329,78 @@ TEST(ControlHub, FindsTheWorldOfACallOrTellsItToComeAgain) {
     return stream->Finish();
   };
   ControlService one{RunPlan()}, two{RunPlan()};
-  hub.Add("one", &one);
-  hub.Add("two", &two);
+  hub.Add("one", {&one, nullptr, ""});
+  hub.Add("two", {&two, nullptr, ""});
   EXPECT_EQ(join("one").error_code(), grpc::StatusCode::UNAUTHENTICATED) << "it reached the run";
   EXPECT_EQ(join("two").error_code(), grpc::StatusCode::UNAUTHENTICATED);
   EXPECT_EQ(join("three").error_message(), "aureole-world: no world 'three' runs here now; come again");
   EXPECT_EQ(join("").error_code(), grpc::StatusCode::UNAVAILABLE);
   hub.Remove("two");
   EXPECT_EQ(join("two").error_code(), grpc::StatusCode::UNAVAILABLE);
+  server->Shutdown(std::chrono::system_clock::now());
+}
+
+TEST(ControlHub, OperatorsNameTheWorldTheyMean) {
+  const std::vector<double> edges = {0};
+  World one{*Layout::Columns({})}, two{*Layout::Columns(edges)};
+  one.name = "first";
+  two.name = "second";
+  LayoutDesk one_desk(one), two_desk(two);
+  EventLog one_log, two_log;
+  const auto status = [] { return RunStatus(); };
+  ControlPlaneService one_operators(one_desk, one_log, status), two_operators(two_desk, two_log, status);
+  ControlService servers{RunPlan()};
+  two_log.Add({std::chrono::system_clock::now(), v1::ControlEvent::REGION_LEFT, 0, "of two"});
+  ControlHub hub;
+  grpc::ServerBuilder builder;
+  int port = 0;
+  builder.AddListeningPort("127.0.0.1:0", grpc::InsecureServerCredentials(), &port);
+  builder.RegisterService(&hub.operators());
+  const std::unique_ptr<grpc::Server> server = builder.BuildAndStart();
+  const auto stub = v1::ControlPlane::NewStub(
+      grpc::CreateChannel("127.0.0.1:" + std::to_string(port), grpc::InsecureChannelCredentials()));
+  // The name of the world that answers, or the refusal.
+  const auto name = [&](const std::string& world) {
+    grpc::ClientContext context;
+    if (!world.empty()) context.AddMetadata(kWorldMetadata, world);
+    v1::ControlledWorld out;
+    const grpc::Status s = stub->GetWorld(&context, {}, &out);
+    return s.ok() ? out.name() : s.error_message();
+  };
+  const auto events = [&](const std::string& world, grpc::Status* s) {
+    grpc::ClientContext context;
+    context.AddMetadata(kWorldMetadata, world);
+    const auto stream = stub->WatchEvents(&context, {});
+    std::string out;
+    for (v1::ControlEvent event; stream->Read(&event);) out += event.text();
+    *s = stream->Finish();
+    return out;
+  };
+  EXPECT_EQ(name("x"), "NO_SUCH_WORLD aureole-world: must name a world that runs here, is 'x'; none runs here now");
+  hub.Add("x", {&servers, &one_operators, "first"});
+  hub.Add("y", {&servers, &two_operators, "second"});
+  hub.Add("z", {&servers, nullptr, ""});
+  EXPECT_EQ(name("x"), "first");
+  EXPECT_EQ(name("y"), "second");
+  EXPECT_EQ(name(""), "MISSING aureole-world: must be in the metadata, and name a world; here run: x, y");
+  EXPECT_EQ(name("z"), "NO_SUCH_WORLD aureole-world: must name a world that runs here, is 'z'; here run: x, y");
+  grpc::Status s;
+  EXPECT_EQ(events("y", &s), "of two");
+  EXPECT_TRUE(s.ok()) << s.error_message();
+  EXPECT_EQ(events("x", &s), "");
+  EXPECT_TRUE(s.ok()) << s.error_message();
+  events("w", &s);
+  EXPECT_EQ(s.error_code(), grpc::StatusCode::NOT_FOUND);
+  grpc::ClientContext context;
+  context.AddMetadata(kWorldMetadata, "y");
+  v1::ResizeLayoutRequest request;
+  request.set_columns(3);
+  v1::ResizeLayoutResponse response;
+  EXPECT_TRUE(stub->ResizeLayout(&context, request, &response).ok());
+  EXPECT_TRUE(one_desk.wanted().empty());
+  EXPECT_EQ(two_desk.wanted().size(), 3u);
+  hub.Remove("y");
+  EXPECT_EQ(name("y"), "NO_SUCH_WORLD aureole-world: must name a world that runs here, is 'y'; here run: x");
   server->Shutdown(std::chrono::system_clock::now());
 }
 

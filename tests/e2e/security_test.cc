@@ -10,6 +10,7 @@
 #include <thread>
 
 #include "client/src/channel.h"
+#include "server/control/control_hub.h"
 #include "server/transport/frame_codec.h"
 
 namespace aureole {
@@ -227,6 +228,61 @@ TEST_F(Tokens, EachRefusalHasItsReason) {
   EXPECT_EQ(say(Sha256Hex(good)), "TOKEN_UNKNOWN");  // the file is no key
   EXPECT_EQ(say(elsewhere), "WRONG_WORLD");
   EXPECT_EQ(say(over), "TOKEN_EXPIRED");
+}
+
+TEST_F(Tokens, EachOfSeveralWorldsWantsItsOwn) {
+  const std::string watch = Token({"watch"}, "one"), operate = Token({"watch", "operate"}, "two");
+  World one{*Layout::Columns({})}, two{*Layout::Columns({})};
+  one.name = "one";
+  two.name = "two";
+  LayoutDesk one_desk(one), two_desk(two);
+  EventLog log;
+  ControlPlaneService one_operators(one_desk, log, [] { return RunStatus(); });
+  ControlPlaneService two_operators(two_desk, log, [] { return RunStatus(); });
+  ControlService servers{RunPlan()};
+  ControlHub hub;
+  hub.Add("a", {&servers, &one_operators, "one"});
+  hub.Add("b", {&servers, &two_operators, "two"});
+  const std::unique_ptr<Security> security = Open(Certificates("server"), TokenPath());
+  security->guard().ServeWorlds([&hub](const grpc::ServerContextBase& context, const std::string& known,
+                                       std::string* world) { return hub.TokensFor(context, known, world); });
+  grpc::ServerBuilder builder;
+  int port = 0;
+  security->Listen(&builder, "127.0.0.1:0", &port);
+  security->guard().Register(&builder, v1::Control::service_full_name(), &hub);
+  security->guard().Register(&builder, v1::ControlPlane::service_full_name(), &hub.operators());
+  const std::unique_ptr<grpc::Server> server = builder.BuildAndStart();
+  const std::string endpoint = "127.0.0.1:" + std::to_string(port);
+  const auto channel = client::ChannelTo(endpoint, Trusting(authority_), Fresh());
+  const auto say = [&](const std::string& method, const std::string& token, const std::string& world) {
+    grpc::ClientContext context;
+    context.set_deadline(std::chrono::system_clock::now() + seconds(20));
+    context.AddMetadata("authorization", "Bearer " + token);
+    if (!world.empty()) context.AddMetadata(kWorldMetadata, world);
+    const auto stub = v1::ControlPlane::NewStub(channel);
+    v1::ControlledWorld answer;
+    v1::DrainRegionResponse drained;
+    const grpc::Status s =
+        method == "GetWorld" ? stub->GetWorld(&context, {}, &answer) : stub->DrainRegion(&context, {}, &drained);
+    return s.ok() ? answer.name() : s.error_message().substr(0, s.error_message().find(':'));
+  };
+  EXPECT_EQ(say("GetWorld", watch, "a"), "one");
+  EXPECT_EQ(say("GetWorld", operate, "b"), "two");
+  EXPECT_EQ(say("GetWorld", watch, "b"), "WRONG_WORLD authorization");
+  EXPECT_EQ(say("DrainRegion", watch, "a"), "NO_RIGHT");
+  EXPECT_EQ(say("DrainRegion", operate, "a"), "WRONG_WORLD authorization");
+  EXPECT_EQ(say("GetWorld", watch, ""), "MISSING aureole-world");
+  EXPECT_EQ(say("GetWorld", watch, "c"), "NO_SUCH_WORLD aureole-world");
+  EXPECT_EQ(say("GetWorld", "none of ours", "c"), "TOKEN_UNKNOWN authorization") << "a stranger hears of no world";
+  // Who has a token for one world does not hear of the others.
+  grpc::ClientContext context;
+  context.AddMetadata("authorization", "Bearer " + watch);
+  v1::ControlledWorld answer;
+  const std::string names = v1::ControlPlane::NewStub(channel)->GetWorld(&context, {}, &answer).error_message();
+  EXPECT_TRUE(names.ends_with("here run: a")) << names;
+  // Operators' tokens let no server join.
+  EXPECT_EQ(Call(channel, kJoin, operate), "NOT_A_SERVER no token opens it");
+  server->Shutdown(std::chrono::system_clock::now());
 }
 
 TEST_F(Tokens, SecondTokenOfACallIsRefused) {

@@ -35,6 +35,8 @@ class FakeCluster {
   void SignalControl(int index, int signal);
   bool ControlRuns(int index);
   int Leader();  // whose Pod has the label; -1: none
+  // Which leads to it, host:port.
+  const std::string& service() const { return service_; }
 
   Json World(const std::string& name);  // null when there is none
   std::vector<Json> Pods(const std::string& world);

@@ -3,6 +3,7 @@
 // kAllFaults.
 #include <gtest/gtest.h>
 
+#include <grpcpp/grpcpp.h>
 #include <signal.h>
 
 #include <algorithm>
@@ -14,6 +15,7 @@
 #include <absl/strings/str_cat.h>
 #include <absl/strings/str_format.h>
 
+#include "aureole/v1/control_plane.grpc.pb.h"
 #include "server/control/certificates.h"
 #include "server/control/kubernetes/api_client.h"
 #include "server/control/kubernetes/pod.h"
@@ -520,6 +522,43 @@ TEST_F(WorldLife, IdleWorldShrinksToItsLeastAndAWishLastsForATime) {
   cluster_.StartControl(1);
   cluster_.api().Merge(absl::StrCat(kWorlds, "w"), {{"spec", {{"regions", {{"min", 2}}}}}});
   ASSERT_TRUE(Await([&] { return is(2); })) << Status().dump(1);
+}
+
+TEST_F(WorldLife, OperatorsReachTheirWorldByName) {
+  cluster_.StartControl(0);
+  Create(Spec());
+  ASSERT_TRUE(AwaitTick(50));
+  const auto stub = v1::ControlPlane::NewStub(
+      grpc::CreateChannel(absl::StrCat(cluster_.service(), ":7100"), grpc::InsecureChannelCredentials()));
+  const auto context = [](const std::string& world) {
+    auto out = std::make_unique<grpc::ClientContext>();
+    out->set_deadline(std::chrono::system_clock::now() + seconds(20));
+    out->AddMetadata("aureole-world", world);
+    return out;
+  };
+  v1::ControlledWorld world;
+  grpc::Status s = stub->GetWorld(context("other").get(), {}, &world);
+  EXPECT_EQ(s.error_code(), grpc::StatusCode::NOT_FOUND);
+  EXPECT_TRUE(absl::EndsWith(s.error_message(), "here run: w")) << s.error_message();
+  s = stub->GetWorld(context("w").get(), {}, &world);
+  EXPECT_TRUE(s.ok()) << s.error_message();
+  EXPECT_EQ(world.regions_size(), 2);
+  v1::DrainRegionRequest drain;
+  drain.set_region(1);
+  v1::DrainRegionResponse drained;
+  s = stub->DrainRegion(context("w").get(), drain, &drained);
+  EXPECT_TRUE(s.ok()) << s.error_message();
+  const auto call = context("w");
+  v1::WatchEventsRequest request;
+  request.set_follow(true);
+  const auto stream = stub->WatchEvents(call.get(), request);
+  v1::ControlEvent event;
+  bool left = false;
+  while (!left && stream->Read(&event)) left = event.kind() == v1::ControlEvent::REGION_LEFT && event.region() == 1;
+  EXPECT_TRUE(left);
+  call->TryCancel();
+  stream->Finish();
+  ExpectEndAsUndisturbed();
 }
 
 TEST_F(WorldLife, WorldsOfOneControlPlaneDoNotMix) {

@@ -47,12 +47,15 @@ class ControlProcess {
     absl::StatusOr<std::unique_ptr<Security>> security = Security::Open(options_.security);
     if (!security.ok()) return security.status();
     security_ = *std::move(security);
-    if (absl::Status s = security_->CheckListen(options_.listen, false); !s.ok()) return s;
+    if (absl::Status s = security_->CheckListen(options_.listen, true); !s.ok()) return s;
     grpc::ServerBuilder builder;
     ConfigureControlPort(&builder);
     int port = 0;
     security_->Listen(&builder, options_.listen, &port);
     security_->guard().Register(&builder, v1::Control::service_full_name(), &hub_);
+    security_->guard().Register(&builder, v1::ControlPlane::service_full_name(), &hub_.operators());
+    security_->guard().ServeWorlds([this](const grpc::ServerContextBase& context, const std::string& known,
+                                          std::string* world) { return hub_.TokensFor(context, known, world); });
     server_ = builder.BuildAndStart();
     if (server_ == nullptr || port == 0) {
       return absl::UnavailableError(
