@@ -73,6 +73,7 @@ int main(int argc, char** argv) {
   const CLI::App* events = aureole::AddEvents(app, &operate_options);
   const CLI::App* resize = aureole::AddResize(app, &operate_options);
   const CLI::App* drain = aureole::AddDrain(app, &operate_options);
+  const CLI::App* checkpoint = aureole::AddCheckpoint(app, &operate_options);
   const CLI::App* completion = aureole::AddCompletion(app, &completion_options);
   aureole::AddCheck(app, &check_options);
   try {
@@ -96,6 +97,7 @@ int main(int argc, char** argv) {
   if (events->parsed()) return aureole::RunEvents(operate_options);
   if (resize->parsed()) return aureole::RunResize(operate_options);
   if (drain->parsed()) return aureole::RunDrain(operate_options);
+  if (checkpoint->parsed()) return aureole::RunCheckpoint(operate_options);
   if (record->parsed()) return aureole::RunRecord(record_options);
   if (replay->parsed()) return aureole::RunReplay(replay_options);
   if (report->parsed()) return aureole::RunReport(report_options);

@@ -46,9 +46,9 @@ void NameWorld(const OperateOptions& o, grpc::ClientContext* context) {
 template <class Request, class Response>
 int Call(const OperateOptions& o, Stub* stub,
          grpc::Status (Stub::*method)(grpc::ClientContext*, const Request&, Response*), const Request& request,
-         Response* response) {
+         Response* response, std::chrono::milliseconds at_most = kPatience) {
   grpc::ClientContext context;
-  context.set_deadline(std::chrono::system_clock::now() + kPatience);
+  context.set_deadline(std::chrono::system_clock::now() + at_most);
   NameWorld(o, &context);
   return Say((stub->*method)(&context, request, response));
 }
@@ -162,6 +162,15 @@ CLI::App* AddDrain(CLI::App& app, OperateOptions* o) {
   return c;
 }
 
+CLI::App* AddCheckpoint(CLI::App& app, OperateOptions* o) {
+  CLI::App* c = app.add_subcommand("checkpoint", "Have all servers of a running world make a checkpoint now");
+  AddControl(c, o);
+  c->add_flag("--copied", o->copied, "Wait until the copies at the neighbours are durable, too");
+  c->add_option("--wait", o->wait_s, "Seconds to wait at most")->check(CLI::Range(1.0, 86400.0))->capture_default_str();
+  c->footer(std::string("Example:\n  aureole checkpoint --control 127.0.0.1:40000\n\n") + kExitCodesHelp);
+  return c;
+}
+
 int RunWorldCommand(const OperateOptions& o) {
   v1::ControlledWorld world;
   const int code = Call(o, Reach(o).get(), &Stub::GetWorld, v1::GetControlledWorldRequest(), &world);
@@ -219,6 +228,25 @@ int RunDrain(const OperateOptions& o) {
   v1::DrainRegionResponse response;
   const int code = Call(o, stub.get(), &Stub::DrainRegion, request, &response);
   return code == kExitOk ? Await(stub.get(), o) : code;
+}
+
+int RunCheckpoint(const OperateOptions& o) {
+  v1::SaveCheckpointRequest request;
+  request.set_copied(o.copied);
+  v1::SaveCheckpointResponse saved;
+  const int code = Call(o, Reach(o).get(), &Stub::SaveCheckpoint, request, &saved,
+                        std::chrono::milliseconds(static_cast<int64_t>(1e3 * o.wait_s)));
+  if (code != kExitOk) return code;
+  if (o.json) {
+    PrintJson(saved);
+    return kExitOk;
+  }
+  std::cout << "every region has a durable checkpoint of tick " << saved.tick() << " or later\n";
+  for (const v1::SavedRegion& r : saved.regions()) {
+    std::cout << absl::StrFormat("region %d: tick %d, copy of tick %d\n", r.region(), r.tick(), r.copied_tick());
+  }
+  std::cout.flush();
+  return kExitOk;
 }
 
 }  // namespace aureole

@@ -56,6 +56,11 @@ class ControlHub::Operators final : public v1::ControlPlane::CallbackService {
                                         v1::DrainRegionResponse* response) override {
     return Pass(context, [&](auto* to) { return to->DrainRegion(context, request, response); });
   }
+  grpc::ServerUnaryReactor* SaveCheckpoint(grpc::CallbackServerContext* context,
+                                           const v1::SaveCheckpointRequest* request,
+                                           v1::SaveCheckpointResponse* response) override {
+    return Pass(context, [&](auto* to) { return to->SaveCheckpoint(context, request, response); });
+  }
 
  private:
   template <class Call>

@@ -8,14 +8,16 @@
 namespace aureole {
 namespace {
 
-// The message begins with the field, where one is to blame.
+// Where the caller is to blame, the message begins with the field, if it is one's.
 grpc::Status Answer(const absl::Status& s) {
   if (s.ok()) return grpc::Status::OK;
+  const auto code = static_cast<grpc::StatusCode>(s.code());
   const std::string message(s.message());
+  if (absl::IsUnavailable(s)) return Refusal(code, v1::NO_REGION, "", message);
+  if (absl::IsResourceExhausted(s)) return Refusal(code, v1::BUSY, "", message);
   const size_t colon = message.find(": ");
   const std::string field = colon == std::string::npos ? "" : message.substr(0, colon);
-  return Refusal(static_cast<grpc::StatusCode>(s.code()), v1::BAD_VALUE, field,
-                 colon == std::string::npos ? message : message.substr(colon + 2));
+  return Refusal(code, v1::BAD_VALUE, field, colon == std::string::npos ? message : message.substr(colon + 2));
 }
 
 grpc::ServerUnaryReactor* Finish(grpc::CallbackServerContext* context, const grpc::Status& status) {
@@ -26,8 +28,9 @@ grpc::ServerUnaryReactor* Finish(grpc::CallbackServerContext* context, const grp
 
 }  // namespace
 
-ControlPlaneService::ControlPlaneService(LayoutDesk& desk, EventLog& events, std::function<RunStatus()> status)
-    : desk_(desk), events_(events), status_(std::move(status)) {}
+ControlPlaneService::ControlPlaneService(LayoutDesk& desk, EventLog& events, CheckpointDesk& checkpoints,
+                                         std::function<RunStatus()> status)
+    : desk_(desk), events_(events), checkpoints_(checkpoints), status_(std::move(status)) {}
 
 grpc::ServerUnaryReactor* ControlPlaneService::GetWorld(grpc::CallbackServerContext* context,
                                                         const v1::GetControlledWorldRequest*,
@@ -77,6 +80,17 @@ grpc::ServerUnaryReactor* ControlPlaneService::DrainRegion(grpc::CallbackServerC
                                                            const v1::DrainRegionRequest* request,
                                                            v1::DrainRegionResponse*) {
   return Finish(context, Answer(desk_.Drain(request->region())));
+}
+
+grpc::ServerUnaryReactor* ControlPlaneService::SaveCheckpoint(grpc::CallbackServerContext* context,
+                                                              const v1::SaveCheckpointRequest* request,
+                                                              v1::SaveCheckpointResponse* response) {
+  grpc::ServerUnaryReactor* reactor = context->DefaultReactor();
+  checkpoints_.Ask(request->copied(), [reactor, response](const absl::Status& s, const v1::SaveCheckpointResponse& r) {
+    *response = r;
+    reactor->Finish(Answer(s));
+  });
+  return reactor;
 }
 
 }  // namespace aureole

@@ -5,17 +5,19 @@
 #include <string>
 
 #include "aureole/v1/control_plane.grpc.pb.h"
+#include "server/control/checkpoint_desk.h"
 #include "server/control/event_log.h"
 #include "server/control/layout_desk.h"
 #include "server/control/run_status.h"
 
 namespace aureole {
 
-// Thread-safe; no call blocks.
+// Thread-safe; no call blocks. SaveCheckpoint is answered by the desk.
 class ControlPlaneService final : public v1::ControlPlane::CallbackService {
  public:
-  // `desk` and `events` outlive it, and so does what `status` needs, which any thread calls.
-  ControlPlaneService(LayoutDesk& desk, EventLog& events, std::function<RunStatus()> status);
+  // All outlive it, and so does what `status` needs, which any thread calls.
+  ControlPlaneService(LayoutDesk& desk, EventLog& events, CheckpointDesk& checkpoints,
+                      std::function<RunStatus()> status);
 
   grpc::ServerUnaryReactor* GetWorld(grpc::CallbackServerContext* context, const v1::GetControlledWorldRequest* request,
                                      v1::ControlledWorld* response) override;
@@ -25,10 +27,14 @@ class ControlPlaneService final : public v1::ControlPlane::CallbackService {
                                          v1::ResizeLayoutResponse* response) override;
   grpc::ServerUnaryReactor* DrainRegion(grpc::CallbackServerContext* context, const v1::DrainRegionRequest* request,
                                         v1::DrainRegionResponse* response) override;
+  grpc::ServerUnaryReactor* SaveCheckpoint(grpc::CallbackServerContext* context,
+                                           const v1::SaveCheckpointRequest* request,
+                                           v1::SaveCheckpointResponse* response) override;
 
  private:
   LayoutDesk& desk_;
   EventLog& events_;
+  CheckpointDesk& checkpoints_;
   const std::function<RunStatus()> status_;
 };
 

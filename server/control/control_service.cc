@@ -541,6 +541,14 @@ void ControlService::ChangeLayout(RegionId to, uint64_t sequence, const LayoutCh
   if (record.session != nullptr && record.status.ready) record.session->Send(std::move(message));
 }
 
+void ControlService::SaveCheckpoint(RegionId region, Tick tick) {
+  v1::ToRegion message;
+  message.mutable_save_checkpoint()->set_tick(tick);
+  const std::lock_guard lock(mutex_);
+  RegionRecord& record = regions_[static_cast<size_t>(region)];
+  if (record.session != nullptr && record.status.ready) record.session->Send(std::move(message));
+}
+
 std::optional<v1::LayoutOutcome> ControlService::TakeLayoutOutcome() {
   const std::lock_guard lock(mutex_);
   return std::exchange(layout_outcome_, std::nullopt);

@@ -79,6 +79,8 @@ class ControlService final : public v1::Control::CallbackService {
   void Retire(RegionId region);
   // Tells the server of this region, if there is one, to offer the change to the world.
   void ChangeLayout(RegionId to, uint64_t sequence, const LayoutChange& layout);
+  // Tells the server of this region, if there is one, to make a checkpoint.
+  void SaveCheckpoint(RegionId region, Tick tick);
   // What became of a change, as the newest answer to ChangeLayout says, once.
   std::optional<v1::LayoutOutcome> TakeLayoutOutcome();
   // Answers the region's server that was told to end: it leaves, or why it cannot.

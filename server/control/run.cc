@@ -70,6 +70,7 @@ class Runner {
     if (options_.hub != nullptr) options_.hub->Remove(options_.world_name);
     if (service_ != nullptr) service_->Close();
     events().End();
+    if (checkpoints_ != nullptr) checkpoints_->Close();
     if (server_ != nullptr) server_->Shutdown(std::chrono::system_clock::now() + std::chrono::seconds(1));
     if (service_ != nullptr) {
       result->status = service_->Status();
@@ -178,7 +179,9 @@ class Runner {
     service_ = std::make_unique<ControlService>(plan);
     layout_->Serve(service_.get());
     if (options_.layouts != nullptr) {
-      operators_ = std::make_unique<ControlPlaneService>(*options_.layouts, events(),
+      checkpoints_ =
+          std::make_unique<CheckpointDesk>(options_.checkpoint_every, options_.layouts->world().environment.tick_us);
+      operators_ = std::make_unique<ControlPlaneService>(*options_.layouts, events(), *checkpoints_,
                                                          [service = service_.get()] { return service->Status(); });
     }
     if (options_.hub != nullptr) {
@@ -228,6 +231,9 @@ class Runner {
       status.control = address_;
       TellOfStorage(status);
       if (scaling_.has_value()) scaling_->Step(status);
+      if (checkpoints_ != nullptr) {
+        checkpoints_->Step(status, [this](RegionId r, Tick tick) { service_->SaveCheckpoint(r, tick); });
+      }
       if (absl::Status s = Keep(status); !s.ok()) return s;
       if (absl::Status s = Act(status); !s.ok()) return s;
       const auto now = Clock::now();
@@ -454,6 +460,7 @@ class Runner {
   EventLog own_events_;
   std::unique_ptr<Security> security_;
   std::unique_ptr<ControlService> service_;
+  std::unique_ptr<CheckpointDesk> checkpoints_;
   std::unique_ptr<ControlPlaneService> operators_;
   std::unique_ptr<grpc::Server> server_;  // ends before the services
   std::unique_ptr<LayoutRun> layout_;

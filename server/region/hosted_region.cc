@@ -194,6 +194,10 @@ absl::Status HostedRegion::ChangeLayout(const v1::ChangeLayout& change) {
   return absl::OkStatus();
 }
 
+void HostedRegion::SaveAt(Tick n) {
+  if (loop_ != nullptr) loop_->SaveAt(n);
+}
+
 HostedRegion::~HostedRegion() { Stop(); }
 
 void HostedRegion::Connect(PeerService* service, const std::shared_ptr<grpc::ChannelCredentials>& credentials) {

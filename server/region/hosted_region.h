@@ -57,6 +57,8 @@ class HostedRegion {
   void PeerLeft(const v1::PeerLeft& left);
   // Offers the change to the world, once the tick thread runs. InvalidArgument when it is none.
   absl::Status ChangeLayout(const v1::ChangeLayout& change);
+  // Makes a checkpoint after tick n, or soon after it; nothing without a journal, or before Start.
+  void SaveAt(Tick n);
   // Ends the tick thread. Idempotent.
   void Stop();
 

@@ -332,6 +332,9 @@ absl::Status Process::Handle(const v1::ToRegion& message) {
   } else if (message.has_change_layout()) {
     if (hosted == nullptr) return absl::FailedPreconditionError("a change of the layout before the assignment");
     return hosted->ChangeLayout(message.change_layout());
+  } else if (message.has_save_checkpoint()) {
+    if (hosted == nullptr) return absl::FailedPreconditionError("a checkpoint is asked for before the assignment");
+    hosted->SaveAt(message.save_checkpoint().tick());
   }
   return absl::OkStatus();
 }

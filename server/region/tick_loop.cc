@@ -51,6 +51,11 @@ TickLoop::TickLoop(const World& world, Region* region, RegionLinks* links, Journ
   for (const aureole::Checkpoint::Hash& h : options_.hashes) AddHash(h);
 }
 
+void TickLoop::SaveAt(Tick n) {
+  const std::lock_guard lock(offers_mutex_);
+  save_at_.insert(n);
+}
+
 void TickLoop::Stop() {
   stopped_ = true;
   links_->Interrupt();
@@ -74,7 +79,7 @@ bool TickLoop::Run() {
     if (Clock::now() - reported_at_ >= kReportEvery || pending_.windows_size() > 0) Report({}, false);
     if (journal_ != nullptr) {  // when nobody waits for this region's frames
       TellDurable();
-      Checkpoint(options_.checkpoint_every);
+      Checkpoint(IsAskedToSave() ? 0 : options_.checkpoint_every);
     }
   }
   EndLap();
@@ -216,6 +221,12 @@ void TickLoop::Submit(const Input& input) {
 
 void TickLoop::TellDurable() {
   if (const std::optional<Journal::Used> used = journal_->TakeDurable()) links_->SetDurable(*used);
+}
+
+bool TickLoop::IsAskedToSave() {
+  const std::lock_guard lock(offers_mutex_);
+  save_at_.erase(save_at_.begin(), save_at_.upper_bound(checkpointed_));
+  return !save_at_.empty() && *save_at_.begin() <= region_->tick();
 }
 
 // Unless the last one is not yet so many ticks old, or still being written.

@@ -7,6 +7,7 @@
 #include <deque>
 #include <functional>
 #include <mutex>
+#include <set>
 #include <string>
 #include <vector>
 
@@ -62,6 +63,8 @@ class TickLoop {
   bool Run();
   // From any thread. A change of the layout, offered to the region like an input of a client.
   void Offer(const Input& change);
+  // From any thread. With a journal: a checkpoint after tick n, or as soon after it as the last one is written.
+  void SaveAt(Tick n);
   // From any thread, also before Run; Run returns soon after.
   void Stop();
   // From any thread: the next report says the newest hashes again, which may not have been heard.
@@ -81,6 +84,7 @@ class TickLoop {
   void OfferInputs();
   void Submit(const Input& input);
   void TellDurable();
+  bool IsAskedToSave();
   void Checkpoint(Tick after);
   void EndReplay();
   void AddHash(const aureole::Checkpoint::Hash& h);
@@ -104,6 +108,7 @@ class TickLoop {
   std::atomic<int64_t> said_bodies_;
   std::mutex offers_mutex_;
   std::vector<Input> offers_;
+  std::set<Tick> save_at_;
 
   FrameClock clock_;
   WindowMeter windows_;

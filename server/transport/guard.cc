@@ -162,6 +162,7 @@ const std::map<std::string, Access>& MethodAccess() {
       {"aureole.v1.ControlPlane.WatchEvents", kOperate},  // they name files and machines
       {"aureole.v1.ControlPlane.ResizeLayout", kOperate},
       {"aureole.v1.ControlPlane.DrainRegion", kOperate},
+      {"aureole.v1.ControlPlane.SaveCheckpoint", kOperate},
   };
   return table;
 }

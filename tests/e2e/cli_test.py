@@ -197,6 +197,11 @@ class Processes(Cli):
             self.assertIn(" warning REGION_REPLACED region ", follower.stdout.readline())
             follower.send_signal(signal.SIGINT)
             self.assertEqual(follower.wait(DEADLINE_S), 0)
+            out = subprocess.run([AUREOLE, "checkpoint", "--control", address, "--json"], stdout=subprocess.PIPE, text=True,
+                                 timeout=DEADLINE_S, check=True).stdout
+            saved = json.loads(out)
+            self.assertEqual([region["region"] for region in saved["regions"]], [0, 1, 2, 3])
+            self.assertTrue(all(int(region["tick"]) >= int(saved["tick"]) > 0 for region in saved["regions"]), saved)
             third.send_signal(signal.SIGINT)
             self.assertEqual(third.wait(DEADLINE_S), 0)
             self.assertFalse(any(alive(pid) for pid in pids))

@@ -348,7 +348,9 @@ TEST(ControlHub, OperatorsNameTheWorldTheyMean) {
   LayoutDesk one_desk(one), two_desk(two);
   EventLog one_log, two_log;
   const auto status = [] { return RunStatus(); };
-  ControlPlaneService one_operators(one_desk, one_log, status), two_operators(two_desk, two_log, status);
+  CheckpointDesk checkpoints(0, 16000);
+  ControlPlaneService one_operators(one_desk, one_log, checkpoints, status);
+  ControlPlaneService two_operators(two_desk, two_log, checkpoints, status);
   ControlService servers{RunPlan()};
   two_log.Add({std::chrono::system_clock::now(), v1::ControlEvent::REGION_LEFT, 0, "of two"});
   ControlHub hub;

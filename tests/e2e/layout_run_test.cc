@@ -1,6 +1,7 @@
 // Runs whose layout changes: servers are started and leave as operators want it, and every body is where the undivided
 // world has it, also while servers are killed.
 #include <gtest/gtest.h>
+#include <signal.h>
 #include <unistd.h>
 
 #include <grpcpp/grpcpp.h>
@@ -281,6 +282,56 @@ TEST_F(LayoutRunTest, OperatorsResizeAndDrainByCalls) {
   EXPECT_EQ(heard[3].endpoints(0), server);
   EXPECT_EQ(heard[3].endpoints(1), "");
   EXPECT_EQ(heard[3].endpoints(2), heard[1].endpoints(2));
+  ExpectExact();
+}
+
+TEST_F(LayoutRunTest, ServerThatDiesGoesOnFromTheCheckpointThatWasAskedFor) {
+  options_.checkpoint_every = 1'000'000;  // none by itself
+  std::atomic<bool> answered = false;
+  v1::SaveCheckpointResponse saved;
+  grpc::Status said;
+  std::thread operator_;
+  Tick at_call = 0, resumed = -1;
+  pid_t killed = 0;
+  LocalAllocator allocator({"", directory_ / "logs", false, directory_ / "data"});
+  const auto end = Killer::Clock::now() + std::chrono::seconds(60);
+  const absl::Status s = RunWorld(
+      options_, allocator,
+      [&](const RunStatus& status) {
+        if (Killer::Clock::now() > end) return false;
+        if (status.stage != Stage::kRunning || status.MinTick() < 30) return true;
+        const RegionStatus& r = status.regions[0];
+        if (!operator_.joinable()) {
+          at_call = status.MaxTick();
+          operator_ = std::thread([&, control = status.control] {
+            const auto stub =
+                v1::ControlPlane::NewStub(grpc::CreateChannel(control, grpc::InsecureChannelCredentials()));
+            grpc::ClientContext context;
+            context.set_deadline(std::chrono::system_clock::now() + std::chrono::seconds(20));
+            v1::SaveCheckpointRequest request;
+            request.set_copied(true);
+            said = stub->SaveCheckpoint(&context, request, &saved);
+            answered = true;
+          });
+        } else if (answered && killed == 0) {
+          killed = static_cast<pid_t>(r.pid);
+          kill(killed, SIGKILL);
+        } else if (killed != 0 && resumed < 0 && r.incarnation == 2 && r.ready) {
+          resumed = r.report.tick();
+        }
+        return resumed < 0 || status.MinTick() < saved.tick() + 60;
+      },
+      &result_);
+  if (operator_.joinable()) operator_.join();
+  EXPECT_EQ(s.code(), absl::StatusCode::kCancelled) << s;
+  ASSERT_TRUE(said.ok()) << said.error_message();
+  EXPECT_GT(saved.tick(), at_call);
+  ASSERT_EQ(saved.regions_size(), 2);
+  for (const v1::SavedRegion& r : saved.regions()) {
+    EXPECT_EQ(r.tick(), saved.tick()) << "region " << r.region() << ": all hear of it in time";
+    EXPECT_EQ(r.copied_tick(), saved.tick());
+  }
+  EXPECT_GE(resumed, saved.tick());
   ExpectExact();
 }
 

@@ -149,7 +149,8 @@ class GuardedServer {
   const World world_{*Layout::Columns({})};
   LayoutDesk desk_{world_};
   EventLog events_;
-  ControlPlaneService operators_{desk_, events_, [] { return RunStatus(); }};
+  CheckpointDesk checkpoints_{0, 16000};
+  ControlPlaneService operators_{desk_, events_, checkpoints_, [] { return RunStatus(); }};
   PeerLink link_;
   int port_ = 0;
   std::unique_ptr<grpc::Server> server_;

@@ -237,8 +237,9 @@ TEST_F(Tokens, EachOfSeveralWorldsWantsItsOwn) {
   two.name = "two";
   LayoutDesk one_desk(one), two_desk(two);
   EventLog log;
-  ControlPlaneService one_operators(one_desk, log, [] { return RunStatus(); });
-  ControlPlaneService two_operators(two_desk, log, [] { return RunStatus(); });
+  CheckpointDesk checkpoints(0, 16000);
+  ControlPlaneService one_operators(one_desk, log, checkpoints, [] { return RunStatus(); });
+  ControlPlaneService two_operators(two_desk, log, checkpoints, [] { return RunStatus(); });
   ControlService servers{RunPlan()};
   ControlHub hub;
   hub.Add("a", {&servers, &one_operators, "one"});
