@@ -245,12 +245,12 @@ WorldRunner::Next WorldRunner::RunOnce(WorldResource world) {
       allocator.Use(world.pods);
       if (!not_applied.empty()) Tell(true, "CannotChange", not_applied);
     }
-    if (!world.scaling.on() && context_->leads() && !stopping_) {
+    if (context_->leads() && !stopping_) {
       if (absl::Status s = replicas.Look(*Latest(), world.replicas); !s.ok()) {
         Tell(true, "CannotScale", absl::StrCat("spec.replicas: cannot be written: ", std::string(s.message())));
       }
+      scaler.Look(world, now);
     }
-    scaler.Look(world, now);
     if (Clock::now() >= next_publish || now.stage != stage) {
       next_publish = Clock::now() + kPublishEvery;
       stage = now.stage;

@@ -33,12 +33,11 @@ void WorldScaler::Look(const WorldResource& world, const RunStatus& status) {
   if (std::optional<Scaling> scaling = autoscaler_->Look(SeeLoad(status, layout, Clock::now()))) {
     wanted_ = std::move(scaling);
   }
-  // What a person has not said, or not within the bounds.
-  if (world.replicas_given != world.replicas && corrected_ != world.generation && !wanted_.has_value()) {
-    wanted_ = {world.replicas_given, world.replicas, ""};
-    if (world.replicas_given != 0) {
-      wanted_->why = absl::StrCat("there must be ", world.scaling.min_regions, " to ", world.scaling.max_regions);
-    }
+  // What a person has said, but not within the bounds.
+  const bool beyond = world.replicas_given != 0 && world.replicas_given != world.replicas;
+  if (beyond && corrected_ != world.generation && !wanted_.has_value()) {
+    wanted_ = {world.replicas_given, world.replicas,
+               absl::StrCat("there must be ", world.scaling.min_regions, " to ", world.scaling.max_regions)};
   }
   if (wanted_.has_value() && Clock::now() >= next_try_ && leads_()) Write(world, status);
 }
@@ -57,9 +56,8 @@ void WorldScaler::Write(const WorldResource& world, const RunStatus& status) {
   }
   told_ = absl::OkStatus();
   corrected_ = world.generation;
-  if (s = desk_->ResizeTo(wanted_->to, WeightsOf(status)); !s.ok())
-    tell_(true, "CannotScale", std::string(s.message()));
-  if (s.ok() && !wanted_->why.empty()) tell_(false, "Scaled", wanted_->Text());
+  s = desk_->ResizeTo(wanted_->to, WeightsOf(status));
+  tell_(!s.ok(), s.ok() ? "Scaled" : "CannotScale", s.ok() ? wanted_->Text() : std::string(s.message()));
   wanted_.reset();
 }
 
