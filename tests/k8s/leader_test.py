@@ -32,8 +32,9 @@ class Leader(WorldTest):
         """Another one leads, says so, and knows the world; the servers did not notice."""
         wait_for(lambda: self.transitions() > self.epoch and self.holder(), "the next leader")
         self.measure("until another leads", time.monotonic() - since, bar)
-        wait_for(lambda: [p["metadata"]["name"] for p in pods(CONTROL + ",aureole.dev/role=leader")
-                          if p["metadata"]["name"] != self.old], "the leader's label")
+        # It may be the same Pod, with a new container.
+        wait_for(lambda: [p for p in pods(CONTROL + ",aureole.dev/role=leader") if p["metadata"]["name"] in self.holder()],
+                 "the leader's label")
         tick = int(self.world.status()["tick"])
         wait_for(lambda: int(self.world.status()["tick"]) > tick + 100, "a status by the new leader")
         self.measure("until it tells the World's state", time.monotonic() - since)
