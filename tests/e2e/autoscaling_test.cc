@@ -6,7 +6,6 @@
 #include <atomic>
 #include <filesystem>
 #include <iterator>
-#include <map>
 #include <memory>
 #include <utility>
 #include <vector>
@@ -18,6 +17,7 @@
 #include "server/control/run.h"
 #include "server/control/sqlite_store.h"
 #include "server/transport/world_spec.h"
+#include "tests/e2e/exact_run.h"
 #include "tests/e2e/killer.h"
 
 namespace aureole {
@@ -107,30 +107,10 @@ class AutoscalingTest : public testing::Test {
 
   // Of every tick that all have reported, from this one on.
   void ExpectExact(Tick from = 0) {
-    RunOptions options = options_;
-    options.layouts = nullptr;
-    options.store = nullptr;
-    options.leave = nullptr;
-    options.scaling = {};
-    options.undivided = options.no_real_time = true;
-    options.regions = 1;
-    options.checkpoint_every = 0;
-    options.last_tick = result_.status.MinTick() / options.hash_every * options.hash_every;
-    LocalAllocator allocator({});
-    RunResult whole;
-    const absl::Status s = RunWorld(
-        options, allocator, [](const RunStatus&) { return true; }, &whole);
-    ASSERT_TRUE(s.ok()) << s;
-    std::map<Tick, TickSum> found;
-    for (const TickSum& sum : result_.hashes) found[sum.tick] = sum;
-    ASSERT_GT(whole.hashes.size(), 10u);
-    EXPECT_EQ(whole.hashes.back().bodies, 5 * kHeap);
-    for (const TickSum& expected : whole.hashes) {
-      if (expected.tick < from) continue;
-      ASSERT_EQ(found[expected.tick].bodies, expected.bodies) << "tick " << expected.tick << "\n" << events_;
-      ASSERT_EQ(found[expected.tick].hash, expected.hash) << "tick " << expected.tick << "\n" << events_;
-    }
-    EXPECT_TRUE(result_.violations.empty());
+    SCOPED_TRACE(events_);
+    TickSum last;
+    ExpectExactSoFar(result_, options_, from, &last);
+    EXPECT_EQ(last.bodies, 5 * kHeap);
     for (const RegionStatus& r : result_.status.regions) EXPECT_EQ(r.report.refused_frames(), 0);
   }
 

@@ -45,9 +45,10 @@ inline void ExpectExact(const RunResult& result, RunOptions options) {
 }
 
 // The same of a run without an end, whose regions may change: every hash from this tick to the one that all have
-// reached.
-inline void ExpectExactSoFar(const RunResult& result, RunOptions options, Tick from = 0) {
+// reached, whose sum is left in `last`.
+inline void ExpectExactSoFar(const RunResult& result, RunOptions options, Tick from = 0, TickSum* last = nullptr) {
   options.layouts = nullptr;
+  options.scaling = {};
   options.store = nullptr;
   options.leave = nullptr;
   options.undivided = options.no_real_time = true;
@@ -68,6 +69,7 @@ inline void ExpectExactSoFar(const RunResult& result, RunOptions options, Tick f
     ASSERT_EQ(found[expected.tick].hash, expected.hash) << "tick " << expected.tick;
   }
   EXPECT_TRUE(result.violations.empty());
+  if (last != nullptr) *last = whole.hashes.back();
 }
 
 }  // namespace aureole

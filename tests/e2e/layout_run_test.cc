@@ -9,7 +9,6 @@
 #include <atomic>
 #include <cstdlib>
 #include <filesystem>
-#include <map>
 #include <thread>
 
 #include "aureole/v1/control_plane.grpc.pb.h"
@@ -20,6 +19,7 @@
 #include "server/control/sqlite_store.h"
 #include "server/control/world_file.h"
 #include "server/transport/world_spec.h"
+#include "tests/e2e/exact_run.h"
 #include "tests/e2e/killer.h"
 
 namespace aureole {
@@ -82,26 +82,8 @@ class LayoutRunTest : public testing::Test {
 
   // Of every tick that all have reported, from this one on.
   void ExpectExact(Tick from = 0) {
-    RunOptions options = options_;
-    options.layouts = nullptr;
-    options.undivided = options.no_real_time = true;
-    options.regions = 1;
-    options.checkpoint_every = 0;
-    options.last_tick = result_.status.MinTick() / options.hash_every * options.hash_every;
-    LocalAllocator allocator({});
-    RunResult whole;
-    const absl::Status s = RunWorld(
-        options, allocator, [](const RunStatus&) { return true; }, &whole);
-    ASSERT_TRUE(s.ok()) << s;
-    std::map<Tick, TickSum> found;
-    for (const TickSum& sum : result_.hashes) found[sum.tick] = sum;
-    ASSERT_GT(whole.hashes.size(), 10u);
-    for (const TickSum& expected : whole.hashes) {
-      if (expected.tick < from) continue;
-      ASSERT_EQ(found[expected.tick].bodies, expected.bodies) << "tick " << expected.tick << "\n" << events_;
-      ASSERT_EQ(found[expected.tick].hash, expected.hash) << "tick " << expected.tick << "\n" << events_;
-    }
-    EXPECT_TRUE(result_.violations.empty());
+    SCOPED_TRACE(events_);
+    ExpectExactSoFar(result_, options_, from);
     for (const RegionStatus& r : result_.status.regions) EXPECT_EQ(r.report.refused_frames(), 0);
   }
 
