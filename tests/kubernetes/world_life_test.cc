@@ -1,6 +1,6 @@
 // Worlds in a fake cluster with real control planes and region servers. Whatever happens to Pods, nodes, leaders and
 // the API server, the world ends bit for bit as one that nothing happened to. The faults of single requests:
-// kAllFaults.
+// world_fault_test.cc.
 #include <gtest/gtest.h>
 
 #include <grpcpp/grpcpp.h>
@@ -24,7 +24,7 @@
 #include "server/control/world_file.h"
 #include "server/transport/health_check.h"
 #include "server/transport/security.h"
-#include "tests/kubernetes/fake_cluster.h"
+#include "tests/kubernetes/world_life.h"
 
 namespace aureole::kubernetes {
 namespace {
@@ -32,90 +32,6 @@ namespace {
 using std::chrono::milliseconds;
 using std::chrono::seconds;
 using Clock = std::chrono::steady_clock;
-
-constexpr char kWorlds[] = "/apis/aureole.dev/v1alpha1/namespaces/test/worlds/";
-constexpr char kPods[] = "/api/v1/namespaces/test/pods/";
-constexpr char kFile[] = AUREOLE_WORLDS "/border-pile.json";
-constexpr int kSeconds = 6;  // of simulated time, in most tests
-
-bool Await(const std::function<bool()>& condition, seconds at_most = seconds(60)) {
-  const auto end = Clock::now() + at_most;
-  while (!condition()) {
-    if (Clock::now() > end) return false;
-    std::this_thread::sleep_for(milliseconds(20));
-  }
-  return true;
-}
-
-std::string FileText() {
-  std::ifstream in(kFile);
-  return std::string(std::istreambuf_iterator<char>(in), {});
-}
-
-// The hash of the last state of an undisturbed run.
-std::string HashOfTheEnd(int length_s) {
-  const absl::StatusOr<WorldFile> file = OpenWorldFile(kFile);
-  EXPECT_TRUE(file.ok()) << file.status();
-  RunOptions options;
-  options.world = file->spec;
-  options.regions = file->world.layout.size();
-  options.no_real_time = true;
-  options.last_tick = TicksIn(length_s, file->world.environment.tick_us);
-  options.hash_every = 100;
-  LocalAllocator allocator({.executable = AUREOLE_REGION, .log_directory = {}});
-  RunResult result;
-  const absl::Status s = RunWorld(
-      options, allocator, [](const RunStatus&) { return true; }, &result);
-  EXPECT_TRUE(s.ok()) << s;
-  return absl::StrFormat("%016x", result.hashes.back().hash);
-}
-
-class WorldLife : public testing::Test {
- protected:
-  ~WorldLife() override {
-    if (HasFailure()) std::cerr << cluster_.World("w").dump(1) << "\n" << cluster_.Logs();
-  }
-  Json Spec() const {
-    return {{"world", Json::parse(FileText())},
-            {"storage", {{"hostPath", cluster_.disk()}}},
-            {"duration", absl::StrCat(seconds_, "s")},
-            {"checkpointSeconds", 0.5},
-            {"hashEvery", 100}};
-  }
-  void Create(const Json& spec) { cluster_.api().Put(absl::StrCat(kWorlds, "w"), {{"kind", "World"}, {"spec", spec}}); }
-  Json Status() { return cluster_.World("w").value("status", Json::object()); }
-  std::string Phase() { return TextAt(Status(), {"phase"}); }
-  int64_t Tick() { return IntegerAt(Status(), {"tick"}).value_or(0); }
-  bool AwaitTick(int64_t tick) {
-    return Await([&] { return Phase() == "Running" && Tick() >= tick; });
-  }
-  uint64_t Incarnation(int region) {
-    const Json status = Status();
-    const Json* const regions = Find(status, {"regions"});
-    return regions == nullptr ? 0 : (*regions)[static_cast<size_t>(region)]["incarnation"].get<uint64_t>();
-  }
-  std::string Condition(const std::string& type, const char* field) {
-    for (const Json& condition : Status().value("conditions", Json::array())) {
-      if (TextAt(condition, {"type"}) == type) return TextAt(condition, {field});
-    }
-    return "";
-  }
-  bool HasEvent(const std::string& reason) {
-    for (const Json& event : cluster_.api().All("/api/v1/namespaces/test/events")) {
-      if (TextAt(event, {"reason"}) == reason) return true;
-    }
-    return false;
-  }
-  void ExpectEndAsUndisturbed() {
-    ASSERT_TRUE(Await([&] { return Phase() == "Finished"; })) << Phase() << " at tick " << Tick();
-    EXPECT_EQ(TextAt(Status(), {"hash", "hash"}), HashOfTheEnd(seconds_));
-    EXPECT_EQ(Condition("Exact", "status"), "True");
-    EXPECT_TRUE(Await([&] { return cluster_.processes() == 0; }));
-  }
-
-  int seconds_ = kSeconds;
-  FakeCluster cluster_;
-};
 
 TEST_F(WorldLife, RunsToItsEndAndSaysSo) {
   cluster_.StartControl(0);
@@ -440,93 +356,6 @@ TEST_F(WorldLife, ChangeThatCannotBeIsSaidAndTheRunGoesOn) {
   ExpectEndAsUndisturbed();
 }
 
-// Budgets count by it; without it, no Pod may ever be evicted.
-TEST_F(WorldLife, WorldThatDoesNotSayHowManyRegionsItHasIsGivenThem) {
-  const auto replicas = [this] { return IntegerAt(cluster_.World("w"), {"spec", "replicas"}).value_or(0); };
-  cluster_.api().Inject({.method = "PATCH", .target = "/worlds/w/scale", .status = 403});
-  seconds_ = 16;
-  cluster_.StartControl(0);
-  Create(Spec());
-  ASSERT_TRUE(Await([&] { return HasEvent("CannotScale"); }));
-  ASSERT_TRUE(Await([&] { return replicas() == 2; })) << "it is tried again";
-  cluster_.api().Merge(absl::StrCat(kWorlds, "w"), {{"spec", {{"replicas", 3}}}});
-  ASSERT_TRUE(Await([&] { return TextAt(Status(), {"regionsReady"}) == "3/3"; }));
-  EXPECT_EQ(replicas(), 3) << "that was the operator's word";
-  EXPECT_EQ(cluster_.api().Count("PATCH /apis/aureole.dev/v1alpha1/namespaces/test/worlds/w/scale"), 2);
-  ExpectEndAsUndisturbed();
-}
-
-TEST_F(WorldLife, ScaledWorldGetsAndLosesServersAndNoBitChanges) {
-  seconds_ = 16;  // so that a slow machine gets there before the end
-  cluster_.StartControl(0);
-  Create(Spec());
-  ASSERT_TRUE(AwaitTick(20));
-  for (const int replicas : {4, 3}) {
-    cluster_.api().Merge(absl::StrCat(kWorlds, "w"), {{"spec", {{"replicas", replicas}}}});
-    const std::string all = absl::StrCat(replicas, "/", replicas);
-    ASSERT_TRUE(Await([&] {
-      return TextAt(Status(), {"regionsReady"}) == all && cluster_.processes() == static_cast<size_t>(replicas);
-    })) << Status().dump(1);
-    EXPECT_EQ(IntegerAt(Status(), {"replicas"}), replicas);
-  }
-  EXPECT_EQ(Condition("Applied", "status"), "True");
-  cluster_.api().Merge(absl::StrCat(kWorlds, "w"), {{"spec", {{"replicas", 65}}}});
-  ASSERT_TRUE(Await([&] { return Condition("Applied", "status") == "False"; }));
-  EXPECT_TRUE(absl::StartsWith(Condition("Applied", "message"), "spec.replicas: is 65"));
-  ExpectEndAsUndisturbed();
-}
-
-// 230 bodies fall at once and are struck; after ten seconds most of them sleep.
-TEST_F(WorldLife, WorldScalesItselfByItsLoadAndNoBitChanges) {
-  seconds_ = 20;
-  cluster_.StartControl(0);
-  Json spec = Spec();
-  spec["regions"] = {
-      {"max", 5}, {"framePercent", 1000}, {"awakeBodies", 150}, {"upAfter", "300ms"}, {"downAfter", "1s"}};
-  spec["replicas"] = 1;
-  Create(spec);
-  const auto members = [this] { return IntegerAt(Status(), {"replicas"}).value_or(0); };
-  ASSERT_TRUE(Await([&] { return members() > 2; })) << Status().dump(1);
-  const int64_t most = IntegerAt(cluster_.World("w"), {"spec", "replicas"}).value_or(0);
-  EXPECT_GT(most, 2);
-  EXPECT_LE(most, 5);
-  ASSERT_TRUE(Await([&] { return members() < most; })) << Status().dump(1);
-  EXPECT_TRUE(Await([&] { return HasEvent("Scaled"); }));
-  EXPECT_EQ(Condition("Applied", "status"), "True");
-  ExpectEndAsUndisturbed();
-}
-
-TEST_F(WorldLife, IdleWorldShrinksToItsLeastAndAWishLastsForATime) {
-  cluster_.StartControl(0);
-  cluster_.api().Inject({.kind = Fault::Kind::kStatus, .method = "PATCH", .target = "/worlds/w/scale", .status = 403});
-  Json spec = Spec();
-  spec.erase("duration");
-  spec["replicas"] = 12;  // too many
-  spec["regions"] = {{"min", 1},
-                     {"max", 3},
-                     {"framePercent", 1000},
-                     {"awakeBodies", 1000000},
-                     {"upAfter", "200ms"},
-                     {"downAfter", "1500ms"}};
-  Create(spec);
-  const auto is = [this](int regions) {  // and the next control plane would know of those that have left
-    return Find(Status(), {"record", "leaving"}) == nullptr &&
-           IntegerAt(cluster_.World("w"), {"spec", "replicas"}) == regions &&
-           TextAt(Status(), {"regionsReady"}) == absl::StrCat(regions, "/", regions) &&
-           cluster_.processes() == static_cast<size_t>(regions);
-  };
-  ASSERT_TRUE(Await([&] { return is(1); })) << Status().dump(1);
-  EXPECT_TRUE(Await([&] { return HasEvent("CannotScale"); }));
-  cluster_.api().Merge(absl::StrCat(kWorlds, "w"), {{"spec", {{"replicas", 3}}}});
-  ASSERT_TRUE(Await([&] { return is(3); })) << Status().dump(1);
-  ASSERT_TRUE(Await([&] { return is(1); })) << Status().dump(1);
-  // The next control plane goes on from there, with other bounds, and fills in what is not there any more.
-  cluster_.SignalControl(0, SIGKILL);
-  cluster_.StartControl(1);
-  cluster_.api().Merge(absl::StrCat(kWorlds, "w"), {{"spec", {{"regions", {{"min", 2}}}, {"replicas", nullptr}}}});
-  ASSERT_TRUE(Await([&] { return is(2); })) << Status().dump(1);
-}
-
 TEST_F(WorldLife, OperatorsReachTheirWorldByName) {
   cluster_.StartControl(0);
   Create(Spec());
@@ -594,71 +423,6 @@ TEST_F(WorldLife, ServersAndControlPlanesShowEachOtherTheirCertificates) {
   ASSERT_TRUE(Await([&] { return Incarnation(1) == 2; }));
   ExpectEndAsUndisturbed();
 }
-
-struct FaultCase {
-  const char* name;
-  Fault fault;
-};
-void PrintTo(const FaultCase& tested, std::ostream* out) { *out << tested.name; }
-
-// Every request that a control plane makes meets every kind of failure, from before the first to after the last.
-class WorldLifeFault : public WorldLife, public testing::WithParamInterface<FaultCase> {};
-
-TEST_P(WorldLifeFault, EndsAsUndisturbed) {
-  cluster_.api().Put("/api/v1/namespaces/test/configmaps/files", {{"data", {{"pile.json", FileText()}}}});
-  Json spec = Spec();
-  spec.erase("world");
-  spec["worldFrom"] = {{"configMap", "files"}, {"key", "pile.json"}};
-  spec["realTime"] = false;
-  spec["storage"] = {{"volumeClaim", {{"size", "1Gi"}}}};
-  cluster_.api().Inject(GetParam().fault);
-  cluster_.StartControl(0);
-  Create(spec);
-  if (GetParam().fault.kind == Fault::Kind::kHang) {
-    EXPECT_TRUE(Await([&] { return cluster_.api().faults_left() == 0; }));
-    cluster_.api().Release();
-  }
-  ExpectEndAsUndisturbed();
-  EXPECT_EQ(cluster_.api().faults_left(), 0u) << "the fault was not met";
-  EXPECT_TRUE(Await([&] { return HasEvent("Finished"); }));
-}
-
-using Kind = Fault::Kind;
-INSTANTIATE_TEST_SUITE_P(
-    kAllFaults, WorldLifeFault,
-    testing::Values(
-        FaultCase{"LeaseStatus503", {.target = "/leases/", .times = 2, .status = 503}},
-        FaultCase{"LeaseReplyLost", {.kind = Kind::kLostReply, .method = "POST", .target = "/leases"}},
-        FaultCase{"OwnPodStatus500", {.target = "/pods/control-0", .times = 5, .status = 500}},
-        FaultCase{"ServiceForbidden", {.target = "/services/", .times = 2, .status = 403}},
-        FaultCase{"LabelStatus503", {.method = "PATCH", .target = "/pods/control-0", .times = 5, .status = 503}},
-        FaultCase{"WorldsListStatus429", {.target = "/worlds?", .status = 429, .retry_after = 1}},
-        FaultCase{"WorldsListReplyCut", {.kind = Kind::kBrokenJson, .target = "/worlds?limit", .times = 2}},
-        FaultCase{"WorldsWatchCutInALine", {.kind = Kind::kHalfLine, .target = "/worlds?watch", .times = 3}},
-        FaultCase{"WorldsWatchGoneByHttpStatus", {.target = "/worlds?watch", .times = 2, .status = 410}},
-        FaultCase{"WorldsWatchGoneByErrorEvent", {.kind = Kind::kGoneEvent, .target = "/worlds?watch", .times = 2}},
-        FaultCase{"WorldsWatchHangs", {.kind = Kind::kHang, .target = "/worlds?watch"}},
-        FaultCase{"ConfigMapStatus503", {.target = "/configmaps/", .times = 6, .status = 503}},
-        FaultCase{"RecordReadStatus500", {.target = "/worlds/w", .times = 3, .status = 500}},
-        FaultCase{"StatusConflict", {.method = "PATCH", .target = "/worlds/w/status", .times = 4, .status = 409}},
-        FaultCase{"StatusStatus503", {.method = "PATCH", .target = "/worlds/w/status", .times = 5, .status = 503}},
-        FaultCase{"StatusReplyLost",
-                  {.kind = Kind::kLostReply, .method = "PATCH", .target = "/worlds/w/status", .times = 3}},
-        FaultCase{"StatusSlow",
-                  {.kind = Kind::kSlow, .method = "PATCH", .target = "/status", .delay = milliseconds(1500)}},
-        FaultCase{"ReplicasStatus503", {.method = "PATCH", .target = "/worlds/w/scale", .status = 503}},
-        FaultCase{"ReplicasReplyLost", {.kind = Kind::kLostReply, .method = "PATCH", .target = "/worlds/w/scale"}},
-        FaultCase{"ClaimStatus500", {.method = "POST", .target = "/persistentvolumeclaims", .times = 3, .status = 500}},
-        FaultCase{"ClaimReplyLost", {.kind = Kind::kLostReply, .method = "POST", .target = "/persistentvolumeclaims"}},
-        FaultCase{"AdoptionStatus503",
-                  {.target = "/pods?labelSelector=aureole.dev%2Fworld", .times = 3, .status = 503}},
-        FaultCase{"PodStatus429", {.method = "POST", .target = "/pods", .times = 3, .status = 429}},
-        FaultCase{"PodReplyLost", {.kind = Kind::kLostReply, .method = "POST", .target = "/pods", .times = 2}},
-        FaultCase{"PodSlow", {.kind = Kind::kSlow, .method = "POST", .target = "/pods", .delay = milliseconds(1500)}},
-        FaultCase{"PodsWatchGone", {.kind = Kind::kGoneEvent, .target = "/pods?watch", .times = 2}},
-        FaultCase{"RemovalStatus503", {.method = "DELETE", .target = "/pods/", .times = 3, .status = 503}},
-        FaultCase{"EventsStatus500", {.method = "POST", .target = "/events", .times = 3, .status = 500}}),
-    [](const auto& tested) { return std::string(tested.param.name); });
 
 }  // namespace
 }  // namespace aureole::kubernetes
